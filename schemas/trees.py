@@ -69,7 +69,7 @@ class Target(Message):
     seq: Counter
     map_id: Name
     status: Literal["none", "tracking", "lost"]
-    """none: no tree is expected in view; tracking: measured now or predicted for a few frames; lost: expected, not seen."""
+    """none: no tree is expected in view; tracking: measured or predicted for a few frames; lost: expected, not seen."""
     tree_id: Annotated[int, Field(ge=0)] | None
     measured: bool
     """True when this very frame showed the trunk, false when the values below are predictions."""

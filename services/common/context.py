@@ -1,0 +1,90 @@
+"""What a service is given: the bus, the clock, its configuration, its health book. Nothing else is global.
+
+A service is a function ``build(context)`` in ``services/<name>/service.py`` that makes its core, warms it and
+registers handlers. The runtime (live, over Zenoh) or the lockstep hub (in memory, for ``process`` and tests) then
+calls the handlers one after the other from a single work loop: a core needs no locks.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Protocol, TypeVar
+
+from schemas.codec import Wire
+from schemas.topics import Topic
+from services.common.clock import Clock
+
+if TYPE_CHECKING:
+    from services.common.config import TreedockConfig
+
+M = TypeVar("M", bound=Wire)
+Q = TypeVar("Q", bound=Wire)
+A = TypeVar("A", bound=Wire)
+
+
+class HealthBook:
+    """Counters, stage timings and the present fault note of one service; the runtime publishes it at 1 Hz."""
+
+    def __init__(self) -> None:
+        self.counters: dict[str, int] = defaultdict(int)
+        self.stage_ms: dict[str, list[float]] = defaultdict(list)
+        self.notes: dict[str, str] = {}
+
+    def count(self, name: str, by: int = 1) -> None:
+        """Add to a counter (``frames``, ``decode_errors``, ``dropped_bad_depth``...)."""
+        self.counters[name] += by
+
+    def note(self, topic: str, text: str) -> None:
+        """Say what is wrong with ``topic`` and what to do; an empty text withdraws it. Any note means degraded."""
+        if text:
+            self.notes[topic] = text
+        else:
+            self.notes.pop(topic, None)
+
+    @contextmanager
+    def timed(self, stage: str) -> Iterator[None]:
+        """Measure a stage's duration."""
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.stage_ms[stage].append((time.perf_counter() - begin) * 1e3)
+
+
+class Context(Protocol):
+    """The service's view of the system."""
+
+    uav: str
+    service: str
+    config: TreedockConfig
+    clock: Clock
+    health: HealthBook
+
+    def on(self, topic: Topic, handler: Callable[[M], None], leaf: str | None = None) -> None:
+        """Call ``handler(message)`` for each sample of ``topic`` (LATEST: only the newest), from the work loop."""
+        ...
+
+    def every(self, period_s: float, handler: Callable[[], None]) -> None:
+        """Call ``handler()`` each ``period_s`` of the clock's time, from the work loop."""
+        ...
+
+    def publish(self, topic: Topic, message: Wire, leaf: str | None = None) -> None:
+        """Send a message; ``leaf`` names the chunk in place of a trailing ``*``."""
+        ...
+
+    def answer(self, topic: Topic, kind: type[Q], handler: Callable[[Q], Wire | None], leaf: str | None = None) -> None:
+        """Answer queries on ``topic``'s key: the request is decoded as ``kind``; None gives no reply."""
+        ...
+
+    def answer_state(self, topic: Topic, handler: Callable[[], list[Wire]]) -> None:
+        """Answer payload-less queries on a published topic's key with its whole present state."""
+        ...
+
+    def ask(
+        self, topic: Topic, request: Wire | None, kind: type[A], timeout_s: float, leaf: str | None = None
+    ) -> list[A]:
+        """Query a key and return the decoded replies; empty when nobody answered in time."""
+        ...

@@ -1,0 +1,114 @@
+"""The bus in memory: the same interface, one thread, first in first out, so that every run is the same.
+
+This is product code: ``treedock process`` runs the services over it in lockstep, and tests inject it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from schemas.codec import Wire
+from schemas.topics import Topic
+from services.common.clock import SimulatedClock
+from services.common.config import TreedockConfig
+from services.common.context import HealthBook
+
+M = TypeVar("M", bound=Wire)
+Q = TypeVar("Q", bound=Wire)
+A = TypeVar("A", bound=Wire)
+
+Handler = Callable[[Any], None]
+
+
+@dataclass
+class _Timer:
+    period_ns: int
+    due_ns: int
+    handler: Callable[[], None]
+
+
+@dataclass
+class Hub:
+    """Joins the contexts of several services; messages pass as objects, in order, when ``run`` is called."""
+
+    config: TreedockConfig
+    clock: SimulatedClock = field(default_factory=SimulatedClock)
+    uav: str = "uav1"
+    _queue: deque[tuple[str, Wire]] = field(default_factory=deque)
+    _handlers: dict[str, list[Handler]] = field(default_factory=dict)
+    _answers: dict[str, Callable[[Any], Wire | None]] = field(default_factory=dict)
+    _states: dict[str, Callable[[], list[Wire]]] = field(default_factory=dict)
+    _timers: list[_Timer] = field(default_factory=list)
+
+    def context(self, service: str) -> MemoryContext:
+        """Return a context for one service."""
+        return MemoryContext(self, service)
+
+    def run(self) -> None:
+        """Deliver everything that is queued, and what that causes, until nothing is left."""
+        while self._queue:
+            key, message = self._queue.popleft()
+            for handler in self._handlers.get(key, ()):
+                handler(message)
+
+    def advance_to(self, stamp_ns: int) -> None:
+        """Move time on to ``stamp_ns``, firing due timers in order of time and registration."""
+        while True:
+            due = min(self._timers, key=lambda timer: timer.due_ns, default=None)
+            if due is None or due.due_ns > stamp_ns:
+                break
+            self.clock.set_ns(due.due_ns)
+            due.due_ns += due.period_ns
+            due.handler()
+            self.run()
+        self.clock.set_ns(stamp_ns)
+
+
+class MemoryContext:
+    """A service's context on a Hub."""
+
+    def __init__(self, hub: Hub, service: str) -> None:
+        self._hub = hub
+        self.service = service
+        self.uav = hub.uav
+        self.config = hub.config
+        self.clock = hub.clock
+        self.health = HealthBook()
+
+    def on(self, topic: Topic, handler: Callable[[M], None], leaf: str | None = None) -> None:
+        """Register a handler; several on one key are called in order of registration."""
+        self._hub._handlers.setdefault(topic.key(self.uav, leaf), []).append(handler)  # noqa: SLF001 - one module
+
+    def every(self, period_s: float, handler: Callable[[], None]) -> None:
+        """Register a timer; it first fires one period from now."""
+        period_ns = round(period_s * 1e9)
+        self._hub._timers.append(_Timer(period_ns, self.clock.now_ns() + period_ns, handler))  # noqa: SLF001
+
+    def publish(self, topic: Topic, message: Wire, leaf: str | None = None) -> None:
+        """Queue a message for its handlers."""
+        self._hub._queue.append((topic.key(self.uav, leaf), message))  # noqa: SLF001
+
+    def answer(self, topic: Topic, kind: type[Q], handler: Callable[[Q], Wire | None], leaf: str | None = None) -> None:
+        """Register the one that answers a query key; requests arrive as objects, so ``kind`` is not needed here."""
+        del kind
+        self._hub._answers[topic.key(self.uav, leaf)] = handler  # noqa: SLF001
+
+    def answer_state(self, topic: Topic, handler: Callable[[], list[Wire]]) -> None:
+        """Register the one that answers with a topic's whole state."""
+        self._hub._states[topic.key(self.uav)] = handler  # noqa: SLF001
+
+    def ask(
+        self, topic: Topic, request: Wire | None, kind: type[A], timeout_s: float, leaf: str | None = None
+    ) -> list[A]:
+        """Ask at once: in memory nobody is late."""
+        del timeout_s
+        key = topic.key(self.uav, leaf)
+        if request is None:
+            state = self._hub._states.get(key)  # noqa: SLF001
+            return [reply for reply in (state() if state else []) if isinstance(reply, kind)]
+        handler = self._hub._answers.get(key)  # noqa: SLF001
+        reply = handler(request) if handler else None
+        return [reply] if isinstance(reply, kind) else []
