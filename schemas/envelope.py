@@ -15,6 +15,7 @@ Quaternion = tuple[float, float, float, float]
 
 Text = Annotated[str, Field(max_length=MAX_TEXT)]
 Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.:-]+$")]
+Label = Annotated[str, Field(min_length=1, max_length=96, pattern=r"^[A-Za-z0-9_.:/*-]+$")]
 StampNs = Annotated[int, Field(ge=0, lt=2**63)]
 """Integer nanoseconds since the Unix epoch (or since the start of simulated time)."""
 Counter = Annotated[int, Field(ge=0, lt=2**63)]

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from schemas.envelope import Counter, Message, Name, StampNs, Text
+from schemas.envelope import Counter, Label, Message, Name, StampNs, Text
 
 Count = Annotated[int, Field(ge=0)]
 
@@ -22,11 +22,11 @@ class Health(Message):
     state: Literal["starting", "ready", "degraded", "stopping"]
     pid: Annotated[int, Field(ge=0)]
     uptime_s: Annotated[float, Field(ge=0.0)]
-    counters: Annotated[dict[Name, Count], Field(max_length=128)]
+    counters: Annotated[dict[Label, Count], Field(max_length=128)]
     """What was done and what was refused since the start: frames, decode_errors, dropped, ..."""
-    rates_hz: Annotated[dict[Name, float], Field(max_length=64)]
+    rates_hz: Annotated[dict[Label, float], Field(max_length=64)]
     """Measured rate of each topic received and sent, over the last second."""
-    work_ms: Annotated[dict[Name, float], Field(max_length=64)]
+    work_ms: Annotated[dict[Label, float], Field(max_length=64)]
     """Median duration of each stage over the last second."""
     note: Text = ""
     """What is wrong and what to do about it; empty when all is well."""

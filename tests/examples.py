@@ -1,0 +1,87 @@
+"""One example of every message, used by the golden-bytes, fuzzing and bus tests."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from schemas.camera import Intrinsics, RgbdFrame
+from schemas.codec import Wire
+from schemas.command import Command, CommandReply, NonceReply, NonceRequest
+from schemas.health import Health
+from schemas.mapping import Submap
+from schemas.navigation import Guidance, MissionState, Setpoint
+from schemas.simulation import SimClock, SimTruth, TrueTree
+from schemas.slam import Graph, GraphNode, Keyframe, Pose, Transform
+from schemas.trees import Target, Tree, TreeList
+from schemas.vehicle import VehicleState
+
+INTRINSICS = Intrinsics(width=4, height=2, fx=500.0, fy=501.0, cx=1.5, cy=0.5, k1=0.1, depth_scale=1000.0)
+POSE = Transform(position_m=(1.0, -2.0, 0.5), quaternion_xyzw=(0.5, -0.5, 0.5, -0.5))
+COVARIANCE = tuple(float(i) / 1000.0 for i in range(21))
+TREE = Tree(
+    id=7, x_m=2.5, y_m=-1.0, z_m=-0.1, axis=(0.0, 0.0, 1.0), radius_m=0.12, radius_height_m=1.3, height_seen_m=1.9,
+    sigma_xy_m=0.01, sigma_radius_m=0.004, arc_rad=2.1, confidence=0.9, observations=12, suitable=True,
+)  # fmt: skip
+TARGET = Target(
+    stamp_ns=66_000_000, seq=1, map_id="map-1", status="tracking", tree_id=7, measured=True, bearing_rad=0.05,
+    range_m=1.2, radius_m=0.12, image_x_px=310.0, sigma_bearing_rad=0.002, sigma_range_m=0.01, sigma_radius_m=0.004,
+    raw_image_x_px=311.0, raw_range_m=1.21, raw_radius_m=0.121, position_map_m=(2.5, -1.0),
+    covariance_map_m2=(1e-4, 0.0, 1e-4), note="",
+)  # fmt: skip
+
+
+def frame(width: int = 4, height: int = 2, seq: int = 3) -> RgbdFrame:
+    """Return a small frame whose bytes tell where they came from."""
+    intrinsics = INTRINSICS.model_copy(update={"width": width, "height": height})
+    colour = bytes(i % 251 for i in range(3 * width * height))
+    depth = bytes((i * 7) % 253 for i in range(2 * width * height))
+    return RgbdFrame(66_000_000, seq, intrinsics, colour, depth, accel_camera=(0.1, -9.8, 0.2))
+
+
+def submap() -> Submap:
+    """Return a small submap."""
+    T = np.eye(4)
+    T[:3, 3] = (1.0, 2.0, 3.0)
+    points = np.arange(6, dtype=np.float32).reshape(2, 3)
+    view = np.array([0, 0], dtype=np.uint16)
+    origins = np.zeros((1, 3), dtype=np.float32)
+    colour = np.array([[1, 2, 3], [4, 5, 6]], dtype=np.uint8)
+    return Submap("map-1", 5, 2, 9, 66_000_000, T, points, view, origins, colour)
+
+
+def all_messages() -> dict[str, Wire]:
+    """Return an example of every message by its schema's name."""
+    setpoint = Setpoint(position_m=(0.0, 0.0, 1.5), yaw_rad=0.3, velocity_m_s=(0.1, 0.0, 0.0), yaw_rate_rad_s=0.4)
+    true_tree = TrueTree(x_m=2.5, y_m=-1.0, z_m=-0.1, axis=(0.0, 0.0, 1.0), radius_m=0.12, suitable=True, fair=True)
+    examples: list[Wire] = [
+        frame(),
+        submap(),
+        Pose(stamp_ns=66_000_000, seq=1, map_id="map-1", status="tracking", T_map_camera=POSE, covariance=COVARIANCE,
+             reset_counter=1, graph_version=4, keyframe_id=3, T_keyframe_camera=POSE, inliers=321, up_sigma_rad=0.004,
+             processing_ms=18.5),
+        Keyframe(keyframe_id=3, stamp_ns=66_000_000, map_id="map-1", graph_version=4, T_map_camera=POSE,
+                 intrinsics=INTRINSICS, depth_encoding="png", depth=b"\x89PNG", colour_jpeg=b"\xff\xd8"),
+        Graph(stamp_ns=66_000_000, map_id="map-1", version=5, reset_counter=1, reason="loop",
+              nodes=(GraphNode(keyframe_id=3, T_map_camera=POSE),), up_sigma_rad=0.004),
+        TreeList(stamp_ns=66_000_000, map_id="map-1", version=2, graph_version=5, trees=(TREE,)),
+        TARGET,
+        Guidance(stamp_ns=66_000_000, seq=1, map_id="map-1", command="toward", magnitude=0.4, unit="m", engage=True,
+                 land=False, mission_id=1, reset_counter=1, setpoint=setpoint, reason="approach"),
+        MissionState(stamp_ns=66_000_000, seq=1, map_id="map-1", state="approach", previous="face", since_ns=1,
+                     reason="tree 7 is in the middle of the image", target_tree_id=7, visited_tree_ids=(3,),
+                     docked_count=1, distance_m=1.4, heading_error_rad=-0.01),
+        VehicleState(stamp_ns=66_000_000, seq=1, connected=True, armed=True, mode="offboard", landed="in_air",
+                     quaternion_map_body=(0.0, 0.0, 0.0, 1.0), position_map_m=(0.0, 0.0, 1.5),
+                     velocity_map_m_s=(0.0, 0.0, 0.0), battery_share=0.8, vision_fused=True, operator_override=False,
+                     engaged_mission_id=1, link_age_s=0.02),
+        Health(service="slam", stamp_ns=66_000_000, seq=1, state="ready", pid=12, uptime_s=3.5,
+               counters={"frames": 40}, rates_hz={"camera/rgbd": 15.0}, work_ms={"track": 18.0}),
+        NonceRequest(sender="station"),
+        NonceReply(nonce=bytes(range(16)), valid_s=30.0, next_sequence=1),
+        Command(name="choose", sender="station", nonce=bytes(range(16)), sequence=1, tree_id=7),
+        CommandReply(accepted=False, reason="no tree 7 in the list", state="idle"),
+        SimClock(stamp_ns=66_000_000, seq=1, phase="running", frames=2),
+        SimTruth(stamp_ns=66_000_000, seq=1, scene="single-01", T_map_camera=POSE, trees=(true_tree,), touched=0,
+                 clearance_m=1.2),
+    ]  # fmt: skip
+    return {example.SCHEMA: example for example in examples}  # type: ignore[attr-defined]
