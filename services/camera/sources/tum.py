@@ -1,0 +1,155 @@
+"""TUM RGB-D folders: rgb.txt, depth.txt, [associations.txt], [accelerometer.txt], camera.json.
+
+groundtruth.txt is never opened: results do not depend on it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.camera import Intrinsics, RgbdFrame
+from services.camera.codecs import FrameError, decode_colour_image, decode_depth_image, encode_colour, encode_depth
+from services.camera.config import CameraConfig
+from services.camera.ranging import limit_range
+from services.camera.sources.accelerometer import Accelerometer
+from services.camera.sources.base import BadFrame
+from services.camera.sources.camera_json import read_intrinsics
+from services.camera.sources.text import read_rows, stamp_ns_of
+from services.common.errors import InputError
+
+T = TypeVar("T")
+
+_FIRST_WINDOW_NS = 100_000_000
+"""The first frame has no frame before it; its accelerometer mean is over this long."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """One frame's files; the stamp is the colour image's."""
+
+    stamp_ns: int
+    colour: Path
+    depth: Path
+
+
+def associate(colour_ns: NDArray[np.int64], depth_ns: NDArray[np.int64], within_ns: int) -> list[tuple[int, int]]:
+    """Pair colour and depth stamps: nearest first, each used once, none further apart than ``within_ns``.
+
+    Args:
+        colour_ns: (N,) stamps, any order.
+        depth_ns: (M,) stamps, any order.
+        within_ns: the largest difference.
+
+    Returns:
+        Index pairs (colour, depth) in the order of the colour stamps.
+    """
+    order = np.argsort(depth_ns, kind="stable")
+    ordered = depth_ns[order]
+    candidates = []
+    for i, stamp in enumerate(colour_ns):
+        first, last = np.searchsorted(ordered, [stamp - within_ns, stamp + within_ns + 1])
+        candidates += [(abs(int(ordered[k]) - int(stamp)), int(stamp), i, int(order[k])) for k in range(first, last)]
+    used_colour: set[int] = set()
+    used_depth: set[int] = set()
+    pairs = []
+    for _, stamp, i, k in sorted(candidates):
+        if i not in used_colour and k not in used_depth:
+            used_colour.add(i)
+            used_depth.add(k)
+            pairs.append((stamp, i, k))
+    return [(i, k) for _, i, k in sorted(pairs)]
+
+
+class TumSource:
+    """Frames of one TUM RGB-D folder."""
+
+    paced = True
+
+    def __init__(self, folder: Path, config: CameraConfig) -> None:
+        if not folder.is_dir():
+            raise InputError(f"{folder}: no such folder")
+        self.name = str(folder)
+        self._config = config
+        self._pairs = _pairs(folder, config)
+        self.expected: int | None = len(self._pairs)
+        self.intrinsics: Intrinsics = read_intrinsics(
+            Path(config.camera_file) if config.camera_file else folder / "camera.json"
+        )
+        accelerometer = folder / "accelerometer.txt"
+        self._accelerometer = Accelerometer.from_file(accelerometer) if accelerometer.exists() else None
+
+    def __iter__(self) -> Iterator[RgbdFrame | BadFrame]:
+        """Yield the frames in the order of their stamps."""
+        before_ns = self._pairs[0].stamp_ns - _FIRST_WINDOW_NS
+        for seq, pair in enumerate(self._pairs):
+            try:
+                yield self._load(pair, seq, before_ns)
+            except FrameError as error:
+                yield BadFrame(pair.stamp_ns, str(error))
+            before_ns = pair.stamp_ns
+
+    def _load(self, pair: Pair, seq: int, before_ns: int) -> RgbdFrame:
+        camera, config = self.intrinsics, self._config
+        colour = _decoded(pair.colour, decode_colour_image, camera)
+        depth = _decoded(pair.depth, decode_depth_image, camera)
+        limited = limit_range(depth, camera.depth_scale, config.min_range_m, config.max_range_m)
+        accel = self._accelerometer.mean_between(before_ns, pair.stamp_ns) if self._accelerometer else None
+        return RgbdFrame(
+            stamp_ns=pair.stamp_ns, seq=seq, intrinsics=camera, colour=encode_colour(colour, "bgr8"),
+            depth=encode_depth(limited, "z16"), accel_camera=accel,
+        )  # fmt: skip
+
+
+def _decoded(path: Path, decode: Callable[[bytes, int, int], T], camera: Intrinsics) -> T:
+    try:
+        return decode(path.read_bytes(), camera.width, camera.height)
+    except FileNotFoundError:
+        raise FrameError(f"{path}: no such file") from None
+    except OSError as error:
+        raise FrameError(f"{path}: cannot be read: {error.strerror}") from None
+    except FrameError as error:
+        raise FrameError(f"{path}: {error}") from None
+
+
+def _pairs(folder: Path, config: CameraConfig) -> list[Pair]:
+    """Return the frames of a folder in the order of their stamps.
+
+    Raises:
+        InputError: no list of images, a broken one, two frames of one stamp, or none at all.
+    """
+    listed = folder / "associations.txt"
+    if listed.exists():
+        rows = read_rows(listed, columns=4, what="'stamp colour stamp depth'")
+        pairs = [Pair(stamp_ns_of(r, 0, listed), folder / r.fields[1], folder / r.fields[3]) for r in rows]
+    else:
+        pairs = _associated(folder, config)
+    if not pairs:
+        raise InputError(f"{folder}: no frames: its lists name no colour image with a depth image near it in time")
+    pairs.sort(key=lambda pair: pair.stamp_ns)
+    for before, after in itertools.pairwise(pairs):
+        if before.stamp_ns == after.stamp_ns:
+            raise InputError(f"{folder}: two frames with the stamp {after.stamp_ns / 1e9:.6f}")
+    return pairs
+
+
+def _associated(folder: Path, config: CameraConfig) -> list[Pair]:
+    lists = [folder / "rgb.txt", folder / "depth.txt"]
+    for path in lists:
+        if not path.exists():
+            raise InputError(
+                f"{path}: no such file; expected a TUM RGB-D folder (rgb.txt, depth.txt, camera.json) or an .mcap file"
+            )
+    colour, depth = (read_rows(path, columns=2, what="'stamp file'") for path in lists)
+    colour_ns, depth_ns = (
+        np.array([stamp_ns_of(row, 0, path) for row in rows], dtype=np.int64)
+        for path, rows in zip(lists, (colour, depth), strict=True)
+    )
+    matches = associate(colour_ns, depth_ns, round(config.associate_within_s * 1e9))
+    return [Pair(int(colour_ns[i]), folder / colour[i].fields[1], folder / depth[k].fields[1]) for i, k in matches]
