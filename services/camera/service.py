@@ -123,5 +123,5 @@ class Replay:
 
 def _has_listeners(context: Context) -> bool:
     """Whether somebody wants compressed frames; a bus that cannot tell is taken to have nobody."""
-    ask = getattr(context, "has_listeners", None)
+    ask = getattr(context, "listened", None)
     return bool(ask(CAMERA_COMPRESSED)) if callable(ask) else False

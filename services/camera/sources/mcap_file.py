@@ -155,9 +155,9 @@ def _frame_topic(path: Path) -> tuple[str, int | None]:
         for topic, count in sorted(counts.items()):
             if topic.endswith("/" + wanted) and count:
                 return topic, count
-    if counts:
-        topic = min(counts)
-        return topic, counts[topic]
+    others = sorted(topic for topic, count in counts.items() if count)
+    if others:
+        return others[0], counts[others[0]]
     raise InputError(f"{path}: it holds no {RgbdFrame.SCHEMA} frames; was the camera recorded?")
 
 
