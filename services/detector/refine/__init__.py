@@ -1,0 +1,1 @@
+"""Refinement of mapped trees in the depth image, at frame rate."""

@@ -1,0 +1,184 @@
+"""Objects in the depth image that may be trunks, each with a fitted circle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.camera import Intrinsics
+from services.detector.refine import kernels_fit, kernels_scan
+from services.detector.refine.config import RefinerConfig
+from services.detector.refine.kernels_scan import (
+    FIRST,
+    HOLE,
+    LAST,
+    LEFT_KIND,
+    LEFT_RAD,
+    MAX_M,
+    MIN_M,
+    NEAR_M,
+    RIGHT_KIND,
+    RIGHT_RAD,
+    ROW,
+    SILHOUETTE,
+)
+from services.detector.refine.model import Depth, ExpectedTree, Matrix, Sight
+from services.detector.refine.view import ray_table, window_rows
+
+MAX_RUNS = 4096
+_MAX_OBJECTS = 24
+_QUICK_POINTS = 250
+_QUICK_ITERATIONS = 7
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """The runs of one search, linked into objects."""
+
+    depth: Depth
+    ray_x: Depth
+    ray_y: Depth
+    sight: Sight
+    runs: Matrix
+    label: NDArray[np.int64]
+    objects: int
+    rows: NDArray[np.int64]
+    noise: Matrix
+    focal_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A circle fitted to one object, in the frame along the trunk."""
+
+    object: int
+    parameters: Matrix
+    """(5,): centre away, centre left, radius, lean away, lean left."""
+    covariance: Matrix
+    """(5, 5), inflated for correlated noise."""
+    inliers: int
+    inlier_share: float
+    rms: float
+
+
+def noise_vector(config: RefinerConfig, focal_px: float) -> Matrix:
+    """Return the sensor's noise as the kernels take it."""
+    return np.array([config.noise.per_m, config.noise.floor_m, 1.0 / focal_px])
+
+
+def scan(
+    depth_m: Depth, intrinsics: Intrinsics, sight: Sight, tree: ExpectedTree, reach_m: float,
+    expected: Matrix, bounds: tuple[int, int, int, int], config: RefinerConfig,
+) -> Scan:  # fmt: skip
+    """Search the window ``bounds`` for objects near ``expected`` (2,), the trunk's place in its own frame."""
+    search = config.search
+    u0, u1, v0, v1 = bounds
+    ray_x, ray_y = ray_table(intrinsics)
+    rows = window_rows(v0, v1, search.rows)
+    noise = noise_vector(config, intrinsics.fx)
+    distance = float(np.hypot(expected[0], expected[1]))
+    limits = np.array([
+        search.min_depth_m, search.max_depth_m, tree.z_m + search.min_height_m, tree.z_m + search.max_height_m,
+        max(distance - reach_m, 0.0), distance + reach_m,
+    ])  # fmt: skip
+    runs = np.empty((MAX_RUNS, kernels_scan.RUN_COLUMNS))
+    count = kernels_scan.scan_rows(
+        depth_m, ray_x, ray_y, sight.M, sight.up_row, float(sight.camera_m[2]), rows, u0, u1, limits, noise, runs
+    )
+    label = np.empty(count, np.int64)
+    step = int(rows[1] - rows[0]) if len(rows) > 1 else 1
+    objects = kernels_scan.link_runs(runs, count, step, noise, label)
+    return Scan(depth_m, ray_x, ray_y, sight, runs[:count], label, objects, rows, noise, intrinsics.fx)
+
+
+def candidates(
+    found: Scan, trees: list[tuple[ExpectedTree, Matrix]], reach_m: float, config: RefinerConfig
+) -> list[Fit]:
+    """Return quick fits of the objects that may be one of ``trees`` (with their places in the frame along the trunk)."""
+    fits = []
+    sizes = np.bincount(found.label, minlength=found.objects)
+    least = max(config.search.min_rows, int(config.search.min_height_share * len(found.rows)))
+    order = np.argsort(-sizes, kind="stable")[:_MAX_OBJECTS]
+    for k in order:
+        if sizes[k] < least:
+            break
+        start = _start(found, int(k), trees, reach_m, config)
+        if start is not None:
+            fit = fit_object(found, int(k), start, start, config, quick=True)
+            if fit is not None:
+                fits.append(fit)
+    return fits
+
+
+def _start(
+    found: Scan, k: int, trees: list[tuple[ExpectedTree, Matrix]], reach_m: float, config: RefinerConfig
+) -> Matrix | None:
+    """Return a first circle (5,) for an object, or None when it cannot be any of the trees."""
+    runs = found.runs[found.label == k]
+    near = float(np.median(runs[:, NEAR_M]))
+    tenth = len(runs) // 10
+    if np.sort(runs[:, MAX_M])[-1 - tenth] - np.sort(runs[:, MIN_M])[tenth] > config.search.max_spread_m:
+        return None
+    middle = 0.5 * (runs[:, LEFT_RAD] + runs[:, RIGHT_RAD])
+    half = 0.5 * (runs[:, LEFT_RAD] - runs[:, RIGHT_RAD])
+    whole = _free(runs[:, LEFT_KIND]) & _free(runs[:, RIGHT_KIND])
+    use = whole if int(np.sum(whole)) * 3 >= len(runs) else np.ones(len(runs), dtype=bool)
+    bearing, sine = float(np.median(middle[use])), float(np.sin(np.clip(np.median(half[use]), 0.0, 1.2)))
+    seen_radius = near * sine / max(1.0 - sine, 0.1)
+    best: Matrix | None = None
+    best_distance = reach_m
+    for tree, place in trees:
+        limit = max(config.fit.max_radius_change_m, 3.0 * tree.sigma_radius_m)
+        if seen_radius > 1.6 * (tree.radius_m + limit):
+            continue
+        radius = seen_radius if use is whole else tree.radius_m
+        radius = float(np.clip(radius, config.fit.min_radius_m, config.fit.max_radius_m))
+        centre = (near + radius) * np.array([np.cos(bearing), np.sin(bearing)])
+        distance = float(np.hypot(*(centre - place)))
+        if distance < best_distance:
+            best_distance = distance
+            best = np.array([centre[0], centre[1], radius, 0.0, 0.0])
+    return best
+
+
+def _free(kind: Matrix) -> NDArray[np.bool_]:
+    return (kind == SILHOUETTE) | (kind == HOLE)
+
+
+def fit_object(
+    found: Scan, k: int, start: Matrix, prior: Matrix, config: RefinerConfig, *, quick: bool,
+    prior_radius_sigma_m: float = 0.1,
+) -> Fit | None:  # fmt: skip
+    """Fit the object ``k`` from ``start`` (5,); ``prior`` gives the radius and, with zeros, the lean to prefer."""
+    fit = config.fit
+    limit = _QUICK_POINTS if quick else fit.max_points
+    points = np.empty((limit, kernels_fit.POINT_COLUMNS))
+    n = kernels_fit.gather_points(
+        found.depth, found.ray_x, found.ray_y, found.sight.M, found.runs, found.label, len(found.runs), k, limit,
+        found.noise, points,
+    )  # fmt: skip
+    if n < (fit.min_points // 2 if quick else fit.min_points):
+        return None
+    edges = np.empty((2 * len(found.rows), kernels_fit.EDGE_COLUMNS))
+    m = kernels_fit.gather_edges(found.runs, found.label, len(found.runs), k, edges)
+    sigma = np.array([1.0, 1.0, prior_radius_sigma_m, fit.prior_lean, fit.prior_lean])
+    p, H, stats = np.empty(5), np.empty((5, 5)), np.empty(3)
+    good = kernels_fit.fit_trunk(
+        points, n, edges, m, start, prior, sigma, fit.edge_px / found.focal_px, fit.tukey,
+        _QUICK_ITERATIONS if quick else fit.iterations, p, H, stats,
+    )  # fmt: skip
+    if not good or stats[0] < 3:
+        return None
+    rms = float(np.sqrt(stats[1] / stats[0]))
+    covariance = np.linalg.inv(H) * fit.correlation * max(1.0, rms * rms)
+    return Fit(k, p, covariance, int(stats[0]), float(stats[0] / stats[2]), rms)
+
+
+def extent(found: Scan, k: int) -> tuple[tuple[float, float], tuple[int, int], float]:
+    """Return (left and right column, first and last row, angle seen from the camera) of an object."""
+    runs = found.runs[found.label == k]
+    columns = (float(np.median(runs[:, FIRST])), float(np.median(runs[:, LAST])))
+    angle = float(np.median(runs[:, LEFT_RAD] - runs[:, RIGHT_RAD]))
+    return columns, (int(runs[0, ROW]), int(runs[-1, ROW])), angle
