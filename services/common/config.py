@@ -1,8 +1,19 @@
-"""The one configuration tree: defaults < /etc/treedock/*.toml < --config < TREEDOCK_* < flags."""
+"""The one configuration tree; ``services.common.config_loader`` fills it from files, variables and flags."""
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from services.camera.config import CameraConfig
+from services.cli.run_config import SupervisorConfig
+from services.detector.config import DetectorServiceConfig
+from services.detector.refine.config import RefinerConfig
+from services.navigator.config import NavigatorConfig
+from services.router.config import RouterConfig
+from services.slam.config import SlamConfig
 
 
 class TreedockConfig(BaseModel):
@@ -10,4 +21,26 @@ class TreedockConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    uav: str = "uav1"
+    uav: str = Field(default="uav1", min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.-]+$")
+    """Name of the aircraft: a chunk of every key."""
+    clock: Literal["wall", "sim"] = "wall"
+    """``sim``: time is what ``sim/clock`` says."""
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    router: RouterConfig = RouterConfig()
+    supervisor: SupervisorConfig = SupervisorConfig()
+    camera: CameraConfig = CameraConfig()
+    slam: SlamConfig = SlamConfig()
+    detector: DetectorServiceConfig = DetectorServiceConfig()
+    refiner: RefinerConfig = RefinerConfig()
+    navigator: NavigatorConfig = Field(default_factory=NavigatorConfig)
+
+
+def load_config(file: Path | None = None) -> TreedockConfig:
+    """Return the configuration from its usual places and ``file`` (of ``--config``).
+
+    Raises:
+        InputError: a missing or broken file, an unknown key, an impossible value.
+    """
+    from services.common.config_loader import load
+
+    return load(file).config

@@ -71,8 +71,20 @@ class Context(Protocol):
         """Call ``handler()`` each ``period_s`` of the clock's time, from the work loop."""
         ...
 
+    def every_wall(self, period_s: float, handler: Callable[[], None]) -> None:
+        """Call ``handler()`` each ``period_s`` of real time, even while simulated time stands still (in memory: as every)."""
+        ...
+
+    def on_stop(self, handler: Callable[[], None]) -> None:
+        """Call ``handler()`` once when the service stops, before the bus closes: flush a file, and be quick (< 0.5 s)."""
+        ...
+
     def publish(self, topic: Topic, message: Wire, leaf: str | None = None) -> None:
         """Send a message; ``leaf`` names the chunk in place of a trailing ``*``."""
+        ...
+
+    def listened(self, topic: Topic, leaf: str | None = None) -> bool:
+        """Return whether anybody subscribes to the topic now: for what is only made when somebody wants it."""
         ...
 
     def answer(self, topic: Topic, kind: type[Q], handler: Callable[[Q], Wire | None], leaf: str | None = None) -> None:

@@ -42,6 +42,7 @@ class Hub:
     _answers: dict[str, Callable[[Any], Wire | None]] = field(default_factory=dict)
     _states: dict[str, Callable[[], list[Wire]]] = field(default_factory=dict)
     _timers: list[_Timer] = field(default_factory=list)
+    _at_stop: list[Callable[[], None]] = field(default_factory=list)
 
     def context(self, service: str) -> MemoryContext:
         """Return a context for one service."""
@@ -66,6 +67,11 @@ class Hub:
             self.run()
         self.clock.set_ns(stamp_ns)
 
+    def stop(self) -> None:
+        """Call what the services registered with ``on_stop``."""
+        while self._at_stop:
+            self._at_stop.pop(0)()
+
 
 class MemoryContext:
     """A service's context on a Hub."""
@@ -86,6 +92,18 @@ class MemoryContext:
         """Register a timer; it first fires one period from now."""
         period_ns = round(period_s * 1e9)
         self._hub._timers.append(_Timer(period_ns, self.clock.now_ns() + period_ns, handler))  # noqa: SLF001
+
+    def every_wall(self, period_s: float, handler: Callable[[], None]) -> None:
+        """As ``every``: in memory there is one time."""
+        self.every(period_s, handler)
+
+    def on_stop(self, handler: Callable[[], None]) -> None:
+        """Register what ``Hub.stop`` calls."""
+        self._hub._at_stop.append(handler)  # noqa: SLF001
+
+    def listened(self, topic: Topic, leaf: str | None = None) -> bool:
+        """Return whether a handler is registered for the key."""
+        return topic.key(self.uav, leaf) in self._hub._handlers  # noqa: SLF001
 
     def publish(self, topic: Topic, message: Wire, leaf: str | None = None) -> None:
         """Queue a message for its handlers."""

@@ -1,0 +1,87 @@
+"""The console script ``treedock``: every command, loaded when it is called, and the exit codes.
+
+Nothing heavy is imported here: ``treedock --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from importlib.util import find_spec
+
+import click
+import typer
+
+from services.cli.config_command import config
+from services.cli.run import run
+from services.cli.service_command import SERVICES, service_command
+from services.cli.topic import topic_app
+from services.common.errors import GoalNotReachedError, InputError
+from services.common.process import prepare_process
+
+COMMAND_MODULES = ("process", "detect", "simulate", "catalogue", "bench", "warm", "mission")
+"""Modules beside this one that hold one command of the same name each."""
+
+EXIT_DONE, EXIT_BUG, EXIT_INPUT, EXIT_NO_GOAL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
+
+
+def make_app() -> typer.Typer:
+    """Return the command line with all its commands."""
+    app = typer.Typer(
+        name="treedock",
+        help="Find the trees around a small aircraft with one RGB-D camera, and guide it up to them.",
+        no_args_is_help=True,
+        pretty_exceptions_enable=False,
+        add_completion=False,
+    )
+    app.command()(run)
+    for name in COMMAND_MODULES:
+        if find_spec(f"services.cli.{name}") is not None:
+            module = importlib.import_module(f"services.cli.{name}")
+            app.command(name)(getattr(module, name))
+    app.add_typer(topic_app, name="topic")
+    app.command()(config)
+    for name, about in SERVICES.items():
+        app.command(name, help=about, rich_help_panel="Services (each its own process)")(service_command(name))
+    return app
+
+
+def main() -> None:
+    """Run the command line and exit: 0 done, 1 a bug, 2 bad usage or input, 3 ended without its goal."""
+    prepare_process()
+    sys.exit(invoke(sys.argv[1:]))
+
+
+def invoke(arguments: list[str]) -> int:
+    """Run one command and return its exit code."""
+    try:
+        result = make_app()(arguments, prog_name="treedock", standalone_mode=False)
+    except InputError as error:
+        return _tell(str(error), EXIT_INPUT)
+    except GoalNotReachedError as error:
+        return _tell(str(error), EXIT_NO_GOAL)
+    except click.UsageError as error:
+        where = f" (see `{error.ctx.command_path} --help`)" if error.ctx else ""
+        return _tell(f"{error.format_message()}{where}", EXIT_INPUT)
+    except click.exceptions.Exit as stop:
+        return stop.exit_code
+    except (KeyboardInterrupt, click.Abort):
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:  # the reader of our output went away: `treedock topic echo ... | head`
+        sys.stderr.close()
+        return EXIT_DONE
+    except Exception:  # the one place where a bug ends
+        import traceback
+
+        traceback.print_exc()
+        return _tell("this is a bug in treedock: please report it with the lines above", EXIT_BUG)
+    return result if isinstance(result, int) else EXIT_DONE
+
+
+def _tell(text: str, code: int) -> int:
+    sys.stderr.write(f"treedock: {' '.join(text.split())}\n")
+    return code
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,68 @@
+"""One subcommand per service: ``treedock slam`` runs that process until it is stopped."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from importlib.util import find_spec
+from typing import Annotated
+
+import typer
+
+from services.cli.options import ConfigFile, Port, Settings, loaded
+
+SERVICES = {
+    "router": "The Zenoh router that all nodes meet at.",
+    "camera": "Frames from the sensor, the simulator or a recording.",
+    "slam": "The camera's pose for each frame, keyframes and their graph.",
+    "mapper": "The dense map, submap by submap.",
+    "detector": "Trees in the map, by slicing.",
+    "refiner": "The target tree in the depth image, at frame rate.",
+    "navigator": "The mission: scan, choose, approach, dock.",
+    "autopilot": "The bridge to PX4.",
+    "simulator": "A forest, a camera that sees it, and simulated time.",
+}
+
+_MODULES = {"refiner": "services.detector.refine.service", "autopilot": "services.navigator.autopilot.service"}
+
+
+def service_command(name: str) -> Callable[..., int]:
+    """Return the command that runs the service ``name``."""
+
+    def command(
+        *,
+        config: ConfigFile = None,
+        settings: Settings = None,
+        port: Port = None,
+        sim_clock: Annotated[bool, typer.Option("--sim-clock", help="Live by the simulator's time.")] = False,
+    ) -> int:
+        more = {"clock": "sim"} if sim_clock else {}
+        return run_by_name(name, config, settings, port, more)
+
+    return command
+
+
+def run_by_name(name: str, config: object, settings: list[str] | None, port: int | None, more: dict[str, str]) -> int:
+    """Load the configuration, then the service's module, and run it; service processes end without further ado.
+
+    Raises:
+        InputError: a configuration or an input that the service cannot use.
+    """
+    from pathlib import Path
+
+    from services.common.errors import InputError
+    from services.common.runtime import run_service
+    from services.common.stop import end_process
+
+    tree = loaded(config if isinstance(config, Path) else None, settings, port, more).config
+    if name == "router":
+        from services.router.service import run
+
+        code = run(tree)
+    else:
+        module = _MODULES.get(name, f"services.{name}.service")
+        if find_spec(module) is None:
+            raise InputError(f"the service {name} is not part of this version")
+        code = run_service(name, importlib.import_module(module).build, tree)
+    end_process(code)
+    return code

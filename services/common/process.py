@@ -1,0 +1,24 @@
+"""What must be set in a process before heavy libraries are imported. Imports nothing heavy itself."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+from pathlib import Path
+
+_PR_SET_PDEATHSIG = 1
+
+
+def prepare_process() -> None:
+    """Set what heavy libraries read at import: a writable numba cache, one thread each."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "treedock" / "numba"
+    # beside the code the cache would need write access that a deployment does not give
+    os.environ.setdefault("NUMBA_CACHE_DIR", str(cache))
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+        os.environ.setdefault(name, "1")
+
+
+def die_with_parent() -> None:
+    """Have the kernel send SIGTERM when the process that started this one ends (Linux; man prctl)."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGTERM))

@@ -1,0 +1,277 @@
+"""A live service: the bus joined to one work loop that calls every handler, timer and the health report.
+
+Health comes from the loop that does the work: while a handler hangs no health goes out, and that is how it is noticed.
+"""
+
+from __future__ import annotations
+
+import heapq
+import logging
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import zenoh
+
+from schemas.codec import Wire
+from schemas.envelope import DecodeError
+from schemas.simulation import SimClock
+from schemas.topics import HEALTH, SIM_CLOCK, TOPICS, Topic
+from services.common import sd_notify
+from services.common.bus import Bus
+from services.common.clock import Clock, SimulatedClock, WallClock
+from services.common.config import TreedockConfig
+from services.common.context import HealthBook
+from services.common.errors import InputError
+from services.common.health import HealthReporter, State
+from services.common.inbox import Inbox
+from services.common.logging import Throttle, set_up
+from services.common.session import opened_client, shared_memory_note
+from services.common.stop import StopSignal
+
+LOG = logging.getLogger(__name__)
+
+M = TypeVar("M", bound=Wire)
+Q = TypeVar("Q", bound=Wire)
+A = TypeVar("A", bound=Wire)
+
+Build = Callable[["LiveContext"], object]
+
+_HEALTH_PERIOD_NS = 1_000_000_000
+_LONGEST_WAIT_S = 0.5
+
+
+@dataclass(order=True)
+class _Timer:
+    due_ns: int
+    order: int
+    period_ns: int = field(compare=False)
+    handler: Callable[[], None] = field(compare=False)
+
+    def advance(self, now_ns: int) -> None:
+        """Set the next due time; periods that were missed altogether are skipped, not made up for."""
+        self.due_ns += self.period_ns
+        if self.due_ns <= now_ns:
+            self.due_ns = now_ns + self.period_ns
+
+
+class LiveContext:
+    """A service's context over Zenoh; see ``services.common.context.Context`` for what each operation promises."""
+
+    def __init__(
+        self, service: str, config: TreedockConfig, session: zenoh.Session, clock: Clock | None = None
+    ) -> None:
+        self.service = service
+        self.config = config
+        self.uav = config.uav
+        self.health = HealthBook()
+        self.inbox = Inbox()
+        self.bus = Bus(session, config.uav, self.health, self.inbox)
+        self.clock: Clock = clock or WallClock()
+        self.wall = WallClock()
+        self.topics_in: list[Topic] = []
+        self.at_stop: list[Callable[[], None]] = []
+        self._timers: list[_Timer] = []
+        self._wall_timers: list[_Timer] = []
+        self._throttle = Throttle()
+
+    def on(self, topic: Topic, handler: Callable[[M], None], leaf: str | None = None) -> None:
+        """Call ``handler(message)`` for each sample."""
+        self.topics_in.append(topic)
+        self.bus.subscribe(topic, self._guarded(topic.name, handler), leaf)
+
+    def every(self, period_s: float, handler: Callable[[], None]) -> None:
+        """Call ``handler()`` each ``period_s`` of the clock's time; first after one period."""
+        self._add_timer(self._timers, self.clock, period_s, handler)
+
+    def every_wall(self, period_s: float, handler: Callable[[], None]) -> None:
+        """Call ``handler()`` each ``period_s`` of real time."""
+        self._add_timer(self._wall_timers, self.wall, period_s, handler)
+
+    def _add_timer(self, timers: list[_Timer], clock: Clock, period_s: float, handler: Callable[[], None]) -> None:
+        period_ns = round(period_s * 1e9)
+        heapq.heappush(timers, _Timer(clock.now_ns() + period_ns, len(timers), period_ns, handler))
+
+    def on_stop(self, handler: Callable[[], None]) -> None:
+        """Call ``handler()`` before the bus closes."""
+        self.at_stop.append(handler)
+
+    def publish(self, topic: Topic, message: Wire, leaf: str | None = None) -> None:
+        """Send a message."""
+        self.bus.publish(topic, message, leaf)
+
+    def listened(self, topic: Topic, leaf: str | None = None) -> bool:
+        """Return whether anybody subscribes now."""
+        return self.bus.listened(topic, leaf)
+
+    def answer(self, topic: Topic, kind: type[Q], handler: Callable[[Q], Wire | None], leaf: str | None = None) -> None:
+        """Answer queries that carry a ``kind``."""
+        self.bus.answer(topic, kind, handler, leaf)
+
+    def answer_state(self, topic: Topic, handler: Callable[[], list[Wire]]) -> None:
+        """Answer payload-less queries with the whole state."""
+        self.bus.answer_state(topic, handler)
+
+    def ask(
+        self, topic: Topic, request: Wire | None, kind: type[A], timeout_s: float, leaf: str | None = None
+    ) -> list[A]:
+        """Query a key."""
+        return self.bus.ask(topic, request, kind, timeout_s, leaf)
+
+    def _guarded(self, about: str, handler: Callable[[M], None]) -> Callable[[M], None]:
+        """Return ``handler`` so that bad data is counted and told; any other exception is a bug and passes."""
+
+        def call(message: M) -> None:
+            try:
+                handler(message)
+            except (InputError, DecodeError) as error:
+                self.health.count(f"refused.{about}")
+                self._throttle.log(LOG, logging.WARNING, about, f"refused a message of {about}: {error}")
+
+        return call
+
+    # -- the work loop
+
+    def turn(self) -> None:
+        """Fire what is due, handle the item that waited longest, or wait for the next thing to do."""
+        fired = self._fire(self._wall_timers, self.wall) + self._fire(self._timers, self.clock)
+        taken = self.inbox.take()
+        if taken is not None:
+            box, item = taken
+            box.handler(item)
+        elif not fired:
+            self.inbox.wait(self._wait_s())
+
+    def _fire(self, timers: list[_Timer], clock: Clock) -> int:
+        """Fire each due timer at most once, so that samples get their turn in between."""
+        fired, now_ns = 0, clock.now_ns()
+        while timers and timers[0].due_ns <= now_ns:
+            timer = timers[0]
+            timer.advance(now_ns)
+            heapq.heapreplace(timers, timer)
+            timer.handler()
+            fired += 1
+        return fired
+
+    def _wait_s(self) -> float:
+        waits = [_LONGEST_WAIT_S]
+        if self._wall_timers:
+            waits.append((self._wall_timers[0].due_ns - self.wall.now_ns()) * 1e-9)
+        if self._timers and not self.clock.simulated:
+            waits.append((self._timers[0].due_ns - self.clock.now_ns()) * 1e-9)
+        return max(0.0, min(waits))
+
+    def follow_simulated_clock(self) -> None:
+        """Let ``sim/clock`` set the clock, on Zenoh's thread: time also moves while a handler works."""
+        clock = self.clock
+        if not isinstance(clock, SimulatedClock):
+            return
+
+        def moved(_: str, message: SimClock) -> None:
+            clock.set_ns(message.stamp_ns)
+            if self._timers and self._timers[0].due_ns <= message.stamp_ns:
+                self.inbox.wake()
+
+        self.bus.subscribe_keys(SIM_CLOCK, moved, at_once=True)
+
+
+class _Overdue:
+    """Topics that came and then fell silent (a fault), and those not heard yet (told)."""
+
+    def __init__(self, context: LiveContext) -> None:
+        self._context = context
+        self._topics = [t for t in dict.fromkeys(context.topics_in) if t.timeout_s is not None and t in TOPICS]
+        self._heard_ns: dict[str, tuple[float, int]] = {}
+
+    def update(self) -> str:
+        """Note the silent topics in the health book; return the words for those never heard."""
+        context, waiting = self._context, []
+        now_ns = context.clock.now_ns()
+        for topic in self._topics:
+            last_s = context.bus.last_received_s.get(topic.name)
+            if last_s is None:
+                waiting.append(topic.name)
+                continue
+            seen_s, since_ns = self._heard_ns.get(topic.name, (None, now_ns))
+            if seen_s != last_s:
+                self._heard_ns[topic.name] = (last_s, since_ns := now_ns)
+            silent_s = (now_ns - since_ns) * 1e-9
+            late = topic.timeout_s is not None and silent_s > topic.timeout_s
+            context.health.note(f"silence.{topic.name}", self._words(topic, silent_s) if late else "")
+        return f"waiting for {', '.join(waiting)}" if waiting else ""
+
+    @staticmethod
+    def _words(topic: Topic, silent_s: float) -> str:
+        return f"nothing for {silent_s:.0f} s: is the {topic.producer} service alive?"
+
+
+def run_service(
+    name: str,
+    build: Build,
+    config: TreedockConfig,
+    stop: StopSignal | None = None,
+    session: Callable[[StopSignal], AbstractContextManager[zenoh.Session]] | None = None,
+) -> int:
+    """Run one service until SIGTERM or SIGINT; return its exit code.
+
+    Args:
+        name: of the service: its token is ``live/{name}``, its health ``health/{name}``.
+        build: makes the core, warms it and registers handlers on the context it is given.
+        config: the whole tree.
+        stop: given by a test that has no signals; else the signals are taken over.
+        session: opens the bus; the default is a client of the configured router, waited for until the stop.
+
+    Raises:
+        InputError: a configuration or a file that ``build`` cannot use.
+    """
+    set_up(name, config.log_level)
+    if stop is None:
+        stop = StopSignal()
+        stop.install()
+    if note := shared_memory_note():
+        LOG.warning(note)
+    open_session = session or (lambda s: opened_client(config.router.endpoint, lambda: s.is_set))
+    try:
+        with open_session(stop) as opened:
+            clock: Clock = SimulatedClock() if config.clock == "sim" else WallClock()
+            return _serve(LiveContext(name, config, opened, clock), build, stop)
+    except InputError:
+        if stop.is_set:  # it was only waiting for the router
+            return 0
+        raise
+
+
+def _serve(context: LiveContext, build: Build, stop: StopSignal) -> int:
+    reporter = HealthReporter(context.service, context.health)
+    overdue: _Overdue | None = None
+
+    def report(state: State | None = None) -> None:
+        waiting = overdue.update() if overdue else ""
+        context.bus.count_overflows()
+        health = reporter.report(context.wall.now_ns(), context.bus.passed, state, waiting)
+        context.publish(HEALTH, health, context.service)
+        sd_notify.notify("WATCHDOG=1")
+
+    report("starting")
+    context.follow_simulated_clock()
+    build(context)
+    overdue = _Overdue(context)
+    context.every_wall(_HEALTH_PERIOD_NS * 1e-9, report)
+    context.bus.declare_live(context.service)
+    stop.when_set(context.inbox.wake)
+    sd_notify.notify("READY=1")
+    LOG.info("ready")
+    report()
+    try:
+        while not stop.is_set:
+            context.turn()
+    except Exception:
+        LOG.exception("this is a bug: the service ends, its supervisor starts it again")
+        return 1
+    sd_notify.notify("STOPPING=1")
+    for handler in context.at_stop:
+        handler()
+    report("stopping")
+    LOG.info("stopped")
+    return 0

@@ -1,0 +1,152 @@
+"""Zenoh sessions as treedock opens them: nodes are clients of a router, no scouting, nothing implicit."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import resource
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+
+import zenoh
+
+from services.common.errors import InputError
+
+LOG = logging.getLogger(__name__)
+
+_CLOSE_TIMEOUT_S = 0.5
+_RETRY_S = 0.25
+_ENOUGH_LOCKED_BYTES = 64 * 1024 * 1024
+
+
+def client_config(endpoint: str) -> zenoh.Config:
+    """Return the configuration of a node; ``endpoint`` is for example ``tcp/127.0.0.1:7447``."""
+    return _config({
+        "mode": "client",
+        "connect/endpoints": [endpoint],
+        # lost routers are looked for at short, steady intervals: back within a second of its return
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
+    })  # fmt: skip
+
+
+def router_config(endpoint: str) -> zenoh.Config:
+    """Return the configuration of the router that listens on ``endpoint``."""
+    return _config({"mode": "router", "listen/endpoints": [endpoint]})
+
+
+def _config(values: dict[str, object]) -> zenoh.Config:
+    config = zenoh.Config()
+    common: dict[str, object] = {
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "scouting/delay": 0,  # milliseconds; the default waits half a second at each open
+        "timestamping/enabled": True,  # the advanced publisher's late joiners need it
+    }
+    for key, value in {**common, **values}.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+@contextmanager
+def opened(config: zenoh.Config) -> Iterator[zenoh.Session]:
+    """Open a session and close it whatever happens: an unclosed one hangs the process at its end.
+
+    Raises:
+        zenoh.ZError: when the router cannot be reached or the address cannot be listened on.
+    """
+    session: zenoh.Session = zenoh.open(config)
+    try:
+        yield session
+    finally:
+        closing = threading.Thread(target=session.close, daemon=True)
+        closing.start()
+        closing.join(_CLOSE_TIMEOUT_S)
+        if closing.is_alive():
+            LOG.warning("the bus session did not close within %.1f s and is abandoned", _CLOSE_TIMEOUT_S)
+
+
+@contextmanager
+def opened_client(endpoint: str, stopped: Callable[[], bool], wait_s: float = float("inf")) -> Iterator[zenoh.Session]:
+    """Open a client session, waiting for the router up to ``wait_s`` seconds or until ``stopped()``.
+
+    Raises:
+        InputError: no router in that time; the text says how to start one.
+    """
+    begin = time.monotonic()
+    told = False
+    while not _reachable(endpoint):
+        if stopped() or time.monotonic() - begin > wait_s:
+            raise InputError(f"no router answers at {endpoint}: start `treedock run` or `treedock router`")
+        if not told:
+            LOG.warning("waiting for a router at %s", endpoint)
+            told = True
+        time.sleep(_RETRY_S)
+    with ExitStack() as stack:
+        try:
+            session = stack.enter_context(opened(client_config(endpoint)))
+        except zenoh.ZError as error:
+            raise InputError(f"the router at {endpoint} refused the session: {error}") from error
+        yield session
+
+
+def split_endpoint(endpoint: str) -> tuple[str, str, int]:
+    """Return protocol, host and port of an endpoint such as ``tcp/127.0.0.1:7447``.
+
+    Raises:
+        InputError: when it does not look like one.
+    """
+    protocol, _, address = endpoint.partition("/")
+    host, _, port = address.partition("?")[0].partition("#")[0].rpartition(":")
+    if not (protocol and host and port.isdigit() and 0 < int(port) < 65536):
+        raise InputError(f"{endpoint!r} is no endpoint: expected protocol/host:port, for example tcp/127.0.0.1:7447")
+    return protocol, host.strip("[]"), int(port)
+
+
+def _reachable(endpoint: str) -> bool:
+    """Whether something listens there: asked by a bare connection, cheaper than a failed session."""
+    protocol, host, port = split_endpoint(endpoint)
+    if protocol not in {"tcp", "tls"}:
+        return True
+    try:
+        with socket.create_connection((host, port), timeout=1.0):
+            return True
+    except OSError:
+        return False
+
+
+def port_is_free(host: str, port: int) -> bool:
+    """Whether a router could listen on this TCP address."""
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError:
+            return False
+        return True
+
+
+def free_port(host: str = "127.0.0.1") -> int:
+    """Return a TCP port that nobody listens on at this moment."""
+    with socket.socket() as probe:
+        probe.bind((host, 0))
+        return int(probe.getsockname()[1])
+
+
+def shared_memory_note() -> str:
+    """Return what keeps Zenoh's shared memory off on this machine, or an empty text.
+
+    Its segments are locked in memory; where the limit is too small it is silently off and big frames cost four times
+    as much.
+    """
+    if os.geteuid() == 0:
+        return ""
+    soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if soft in {resource.RLIM_INFINITY} or soft >= _ENOUGH_LOCKED_BYTES:
+        return ""
+    return (
+        f"shared memory is off: {soft // 1024} KB may be locked; raise it (ulimit -l, LimitMEMLOCK=) for cheap frames"
+    )
