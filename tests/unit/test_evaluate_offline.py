@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from schemas.camera import RgbdFrame
+from schemas.slam import Pose
+from schemas.topics import CAMERA_RGBD, SLAM_POSE
+from schemas.trees import Tree
+from services.camera.sources import BadFrame
+from services.common.config import TreedockConfig
+from services.common.context import Context
+from services.common.errors import InputError
+from services.common.geometry import level_camera, to_transform
+from services.evaluate.exports import Stamped
+from services.evaluate.metrics import metrics, summary_ms
+from services.evaluate.offline import Builder, run_offline
+from tests.camera_data import frame, stamp_ns
+
+
+@dataclass
+class StubSlam:
+    """Knows each frame's pose, but the third's."""
+
+    context: Context
+
+    def __post_init__(self) -> None:
+        self.slam = self
+        self.poses: list[Stamped] = []
+        self.ticks = 0
+        self.context.on(CAMERA_RGBD, self.on_frame)
+        self.context.every(0.1, self.tick)
+
+    def tick(self) -> None:
+        self.ticks += 1
+
+    def on_frame(self, image: RgbdFrame) -> None:
+        assert self.context.clock.now_ns() == image.stamp_ns
+        with self.context.health.timed("track"):
+            T = level_camera((0.1 * image.seq, 0.0, 0.0), 0.0)
+        tracked = image.seq != 2
+        if tracked:
+            self.poses.append((image.stamp_ns, T))
+        pose = Pose(
+            stamp_ns=image.stamp_ns, seq=image.seq, map_id="m", status="tracking" if tracked else "lost",
+            T_map_camera=to_transform(T) if tracked else None, covariance=None, reset_counter=0, graph_version=0,
+            keyframe_id=None, T_keyframe_camera=None, inliers=0, up_sigma_rad=0.0, processing_ms=0.0,
+        )  # fmt: skip
+        self.context.publish(SLAM_POSE, pose)
+
+    def final_trajectory(self) -> list[Stamped]:
+        return self.poses
+
+
+@dataclass
+class StubCloud:
+    points_m: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
+
+
+class StubMapper:
+    def __init__(self, context: Context) -> None:
+        del context
+
+    def cloud(self) -> StubCloud:
+        return StubCloud(np.zeros((2, 3), np.float32), np.zeros((2, 3), np.uint8))
+
+
+class StubDetector:
+    def __init__(self, context: Context) -> None:
+        del context
+
+    def final_trees(self) -> list[Tree]:
+        return []
+
+
+BUILDERS: dict[str, Builder] = {"slam": StubSlam, "mapper": StubMapper, "detector": StubDetector}
+
+
+def frames(count: int) -> list[RgbdFrame]:
+    return [frame(i, stamp_ns(i)) for i in range(count)]
+
+
+def test_every_frame_is_processed_in_lockstep() -> None:
+    seen: list[int] = []
+    result = run_offline(
+        frames(6), TreedockConfig(), builders=BUILDERS, progress=lambda counts: seen.append(counts.tracked)
+    )
+    assert result.counts.frames == 6
+    assert seen == [1, 2, 2, 3, 4, 5]
+    assert [stamp for stamp, _ in result.online] == [stamp_ns(i) for i in (0, 1, 3, 4, 5)]
+    assert len(result.stage_ms["slam.track"]) == 6
+    values = metrics(result)
+    assert (values["frames"], values["tracked_final"], values["trees"], values["cloud_points"]) == (6, 5, 0, 2)
+
+
+def test_a_bad_frame_stops_the_run_unless_skipped() -> None:
+    items: list[RgbdFrame | BadFrame] = [*frames(2), BadFrame(5, "x.png: truncated PNG"), frame(3, stamp_ns(3))]
+    with pytest.raises(InputError, match=r"x\.png: truncated PNG"):
+        run_offline(items, TreedockConfig(), builders=BUILDERS)
+    result = run_offline(items, TreedockConfig(), builders=BUILDERS, skip_bad_frames=True)
+    assert result.counts.frames == 3
+    assert result.counts.skipped == ["x.png: truncated PNG"]
+
+
+def test_stamps_that_do_not_rise_are_bad_frames() -> None:
+    items = [frame(0, stamp_ns(0)), frame(1, stamp_ns(0))]
+    with pytest.raises(InputError, match="does not rise"):
+        run_offline(items, TreedockConfig(), builders=BUILDERS)
+
+
+def test_a_source_without_a_usable_frame_is_refused() -> None:
+    with pytest.raises(InputError, match=r"no usable frame among 1: a\.jpg"):
+        run_offline([BadFrame(1, "a.jpg: empty")], TreedockConfig(), builders=BUILDERS, skip_bad_frames=True)
+    with pytest.raises(InputError, match="no frames"):
+        run_offline([], TreedockConfig(), builders=BUILDERS)
+
+
+def test_durations_are_summed_up() -> None:
+    assert summary_ms([]) == {"median": 0.0, "p99": 0.0, "max": 0.0, "count": 0}
+    assert summary_ms([1.0, 2.0, 9.0])["median"] == 2.0
