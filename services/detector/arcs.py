@@ -1,0 +1,366 @@
+"""Circles in slices: RANSAC seeds, then a geometric fit with residuals along the viewing ray.
+
+Depth noise lies along the ray. A radial residual turns it into a bias: points before and behind the surface both
+pull the circle thinner on a one-sided arc. The residual along the ray is the noise itself. With the unit ray ``u``
+(in the plan), the centre ``c`` and the point ``p``: ``a = (c - p) . u``, ``s = (c - p) x u``; the ray enters the
+circle at ``a - sqrt(r^2 - s^2)`` beyond the point. Rays that pass near or beside the rim are continued linearly.
+Without views the residual is radial, ``|p - c| - r`` (Chernov, "Circular and linear regression", 2010, chapter 5).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from services.detector.config import DetectorConfig
+from services.detector.model import Floats, Ints
+from services.detector.voxels import Voxels
+
+RIM = 0.92
+"""Share of the radius beyond which the ray residual is continued linearly."""
+_COLUMNS = 11
+BINS = 36
+"""Bins of the arc coverage, 10 degrees each."""
+
+
+@njit(cache=True, nogil=True)
+def residual(px: float, py: float, ux: float, uy: float, cx: float, cy: float, r: float, J: Floats) -> float:
+    """Return the residual of one point and write its derivatives by (cx, cy, r) to ``J``.
+
+    ``(ux, uy)`` is the unit ray in the plan, or (0, 0) for a radial residual. Positive: the point lies before
+    (radially: outside) the surface.
+    """
+    dx, dy = cx - px, cy - py
+    if ux == 0.0 and uy == 0.0:
+        d = max(np.sqrt(dx * dx + dy * dy), 1e-9)
+        J[0] = dx / d
+        J[1] = dy / d
+        J[2] = -1.0
+        return d - r
+    a = dx * ux + dy * uy
+    s = dx * uy - dy * ux
+    side = 1.0 if s >= 0.0 else -1.0
+    rim = RIM * r
+    if abs(s) <= rim:
+        q = np.sqrt(r * r - s * s)
+        J[0] = ux + s / q * uy
+        J[1] = uy - s / q * ux
+        J[2] = -r / q
+        return a - q
+    k = RIM / np.sqrt(1.0 - RIM * RIM)
+    J[0] = ux + k * side * uy
+    J[1] = uy - k * side * ux
+    J[2] = -np.sqrt(1.0 - RIM * RIM) - k * RIM
+    return a - r * np.sqrt(1.0 - RIM * RIM) + k * (abs(s) - rim)
+
+
+@njit(cache=True, nogil=True)
+def point_sigma(s_share: float, range_m: float, ray: bool, k_range: float, surface: float) -> float:
+    """Return the standard deviation of a residual: depth noise, and surface noise seen at a slant.
+
+    ``s_share`` is the distance of the ray from the axis as a share of the radius.
+    """
+    if not ray:
+        return surface
+    cosine = np.sqrt(max(1.0 - s_share * s_share, 0.10))
+    depth = k_range * range_m * range_m
+    return np.sqrt(depth * depth + (surface / cosine) ** 2)
+
+
+@njit(cache=True, nogil=True)
+def _uniform(state: Ints) -> float:
+    """Return the next number in [0, 1) of a 63-bit linear congruential generator."""
+    state[0] = (state[0] * np.int64(2862933555777941757) + np.int64(3037000493)) & np.int64(0x7FFFFFFFFFFFFFFF)
+    return (state[0] >> 11) / 4503599627370496.0
+
+
+@njit(cache=True, nogil=True)
+def _circumcircle(P: Floats, i: int, j: int, k: int, out: Floats) -> bool:
+    ax, ay = P[j, 0] - P[i, 0], P[j, 1] - P[i, 1]
+    bx, by = P[k, 0] - P[i, 0], P[k, 1] - P[i, 1]
+    cross = 2.0 * (ax * by - ay * bx)
+    if abs(cross) < 1e-9:
+        return False
+    a2, b2 = ax * ax + ay * ay, bx * bx + by * by
+    ux, uy = (by * a2 - ay * b2) / cross, (ax * b2 - bx * a2) / cross
+    out[0], out[1] = P[i, 0] + ux, P[i, 1] + uy
+    out[2] = np.sqrt(ux * ux + uy * uy)
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _score(P: Floats, U: Floats, S: Floats, left: Ints, n: int, c: Floats, r_share: float) -> float:
+    """Return a truncated quadratic count of the points on the visible side, less half of those inside the circle."""
+    score = 0.0
+    step = max(1, n // 150)
+    for q in range(0, n, step):
+        i = left[q]
+        dx, dy = P[i, 0] - c[0], P[i, 1] - c[1]
+        d = np.sqrt(dx * dx + dy * dy)
+        tol = S[i] + r_share * c[2]
+        e = (d - c[2]) / tol
+        if abs(e) < 1.0:
+            facing = dx * U[i, 0] + dy * U[i, 1]
+            if facing <= 0.25 * c[2] + tol:
+                score += 1.0 - e * e
+        elif e < 0.0:
+            score -= 0.5
+    return score * step
+
+
+@njit(cache=True, nogil=True)
+def _seed(
+    P: Floats,
+    U: Floats,
+    S: Floats,
+    left: Ints,
+    n: int,
+    state: Ints,
+    trials: int,
+    r_min: float,
+    r_max: float,
+    best: Floats,
+) -> float:
+    """Return the best score of circles through three near points; writes the circle to ``best``."""
+    top = 0.0
+    c = np.empty(3)
+    for _ in range(trials):
+        i = left[min(n - 1, int(_uniform(state) * n))]
+        j, k = -1, -1
+        for _ in range(10):
+            q = left[min(n - 1, int(_uniform(state) * n))]
+            d2 = (P[q, 0] - P[i, 0]) ** 2 + (P[q, 1] - P[i, 1]) ** 2
+            if q == i or q == j or d2 > 4.0 * r_max * r_max:
+                continue
+            if j < 0:
+                j = q
+            else:
+                k = q
+                break
+        if k < 0 or not _circumcircle(P, i, j, k, c) or not r_min <= c[2] <= r_max:
+            continue
+        score = _score(P, U, S, left, n, c, 0.08)
+        if score > top:
+            top = score
+            best[0], best[1], best[2] = c[0], c[1], c[2]
+    return top
+
+
+@njit(cache=True, nogil=True)
+def solve(A: Floats, y: Floats, x: Floats) -> None:
+    """Solve a small symmetric positive definite system by Cholesky; ``A`` is overwritten."""
+    n = y.shape[0]
+    for i in range(n):
+        for j in range(i + 1):
+            v = A[i, j]
+            for k in range(j):
+                v -= A[i, k] * A[j, k]
+            if i == j:
+                A[i, i] = np.sqrt(max(v, 1e-18))
+            else:
+                A[i, j] = v / A[j, j]
+    for i in range(n):
+        v = y[i]
+        for k in range(i):
+            v -= A[i, k] * x[k]
+        x[i] = v / A[i, i]
+    for i in range(n - 1, -1, -1):
+        v = x[i]
+        for k in range(i + 1, n):
+            v -= A[k, i] * x[k]
+        x[i] = v / A[i, i]
+
+
+@njit(cache=True, nogil=True)
+def _refine(
+    P: Floats,
+    U: Floats,
+    G: Floats,
+    left: Ints,
+    n: int,
+    c: Floats,
+    k_range: float,
+    surface: float,
+    r_min: float,
+    r_max: float,
+) -> float:
+    """Fit the circle ``c`` robustly (Gauss-Newton, Tukey weights on normalised residuals); return the scale factor.
+
+    The scale factor multiplies the expected noise of each point to give the observed one.
+    """
+    J, A, y, x = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty(3)
+    e, sigma = np.empty(n), np.empty(n)
+    scale = 3.0
+    for iteration in range(12):
+        near = 0
+        size = np.empty(n)
+        for q in range(n):
+            i = left[q]
+            ray = U[i, 0] != 0.0 or U[i, 1] != 0.0
+            s = ((c[0] - P[i, 0]) * U[i, 1] - (c[1] - P[i, 1]) * U[i, 0]) / c[2]
+            sigma[q] = point_sigma(s, G[i], ray, k_range, surface)
+            e[q] = residual(P[i, 0], P[i, 1], U[i, 0], U[i, 1], c[0], c[1], c[2], J) / sigma[q]
+            if abs(e[q]) < 4.5 * scale:
+                size[near] = abs(e[q])
+                near += 1
+        if near < 4:
+            return -1.0
+        scale = max(1.0, 1.4826 * np.median(size[:near]))
+        A[:] = 0.0
+        y[:] = 0.0
+        for q in range(n):
+            t = e[q] / (4.0 * scale)
+            if abs(t) >= 1.0:
+                continue
+            i = left[q]
+            residual(P[i, 0], P[i, 1], U[i, 0], U[i, 1], c[0], c[1], c[2], J)
+            w = (1.0 - t * t) ** 2
+            for a in range(3):
+                y[a] -= w * e[q] * J[a] / sigma[q]
+                for b in range(3):
+                    A[a, b] += w * J[a] * J[b] / (sigma[q] * sigma[q])
+        for a in range(3):
+            A[a, a] *= 1.0 + 1e-3
+            A[a, a] += 1e-6
+        solve(A, y, x)
+        step = np.sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2)
+        limit = min(1.0, 0.5 * c[2] / max(step, 1e-12))
+        for a in range(3):
+            c[a] += limit * x[a]
+        c[2] = min(max(c[2], 0.5 * r_min), 1.5 * r_max)
+        if step < 1e-5:
+            break
+    return scale
+
+
+@njit(cache=True, nogil=True)
+def _judge(
+    P: Floats, U: Floats, G: Floats, left: Ints, n: int, c: Floats, scale: float, k_range: float, surface: float, out: Floats,
+    taken: Ints,
+) -> int:  # fmt: skip
+    """Fill a row: circle, noise, points on it, points inside it, arc. Mark what it takes away; return the points on it."""
+    bins = np.zeros(BINS, dtype=np.bool_)
+    on, inside, z, noise = 0, 0, 0.0, 0.0
+    J = np.empty(3)
+    for q in range(n):
+        i = left[q]
+        dx, dy = P[i, 0] - c[0], P[i, 1] - c[1]
+        ray = U[i, 0] != 0.0 or U[i, 1] != 0.0
+        s = (-dx * U[i, 1] + dy * U[i, 0]) / c[2]
+        sigma = scale * point_sigma(s, G[i], ray, k_range, surface)
+        e = residual(P[i, 0], P[i, 1], U[i, 0], U[i, 1], c[0], c[1], c[2], J)
+        taken[q] = 0
+        if abs(e) < 3.0 * sigma and dx * U[i, 0] + dy * U[i, 1] <= 0.4 * c[2] + sigma:
+            on += 1
+            z += P[i, 2]
+            noise += e * e
+            angle = np.arctan2(dy, dx)
+            bins[min(BINS - 1, int((angle + np.pi) / (2.0 * np.pi) * BINS))] = True
+            taken[q] = 1
+        elif dx * dx + dy * dy < (c[2] + sigma) ** 2:
+            inside += 1
+            taken[q] = 1
+    covered = 0
+    for b in range(BINS):
+        covered += 1 if bins[b] or (bins[b - 1] and bins[(b + 1) % BINS]) else 0
+    out[1], out[2], out[4] = c[0], c[1], c[2]
+    out[3] = z / max(on, 1)
+    out[5] = np.sqrt(noise / max(on, 1))
+    out[6], out[7] = on, inside
+    out[8] = covered * 2.0 * np.pi / BINS
+    return on
+
+
+@njit(cache=True, nogil=True)
+def _all_slices(
+    xyz: Floats, ray: Floats, order: Ints, begin: Ints, z_low: float, layer_m: float, k_range: float, surface: float,
+    spacing: float, r_min: float, r_max: float, min_points: int, trials: int, seed: int, out: Floats,
+) -> int:  # fmt: skip
+    rows = 0
+    largest = 0
+    for c in range(begin.shape[0] - 1):
+        largest = max(largest, begin[c + 1] - begin[c])
+    P, U, G, S = np.empty((largest, 3)), np.empty((largest, 2)), np.empty(largest), np.empty(largest)
+    left, taken = np.empty(largest, dtype=np.int64), np.empty(largest, dtype=np.int64)
+    circle = np.empty(3)
+    state = np.empty(1, dtype=np.int64)
+    for c in range(begin.shape[0] - 1):
+        n = begin[c + 1] - begin[c]
+        if n < min_points:
+            continue
+        state[0] = seed + 7919 * c
+        for q in range(n):
+            v = order[begin[c] + q]
+            flat = np.sqrt(ray[v, 0] ** 2 + ray[v, 1] ** 2)
+            G[q] = np.sqrt(flat * flat + ray[v, 2] ** 2)
+            for a in range(3):
+                P[q, a] = xyz[v, a]
+            for a in range(2):
+                U[q, a] = ray[v, a] / flat if flat > 1e-6 else 0.0
+            S[q] = 2.0 * np.sqrt((k_range * G[q] ** 2) ** 2 + surface * surface) + 0.25 * spacing
+            left[q] = q
+        first = n
+        for turn in range(5):
+            if n < min_points or (turn > 0 and n < 0.1 * first) or rows >= out.shape[0]:
+                break
+            tries = trials if first < 400 else 2 * trials
+            if _seed(P, U, S, left, n, state, tries, r_min, r_max, circle) < 0.5 * min_points:
+                break
+            scale = _refine(P, U, G, left, n, circle, k_range, surface, r_min, r_max)
+            if scale < 0.0:
+                break
+            on = _judge(P, U, G, left, n, circle, scale, k_range, surface, out[rows], taken)
+            out[rows, 0] = np.floor((P[left[0], 2] - z_low) / layer_m)
+            out[rows, 9] = G[left[0]]
+            out[rows, 10] = c
+            if on >= min_points and r_min <= circle[2] <= r_max:
+                rows += 1
+            kept = 0
+            for q in range(n):
+                if taken[q] == 0:
+                    left[kept] = left[q]
+                    kept += 1
+            if kept == n:
+                break
+            n = kept
+    return rows
+
+
+@dataclass(frozen=True, slots=True)
+class Circles:
+    """Circles of all slices, one row each."""
+
+    layer: Ints
+    xyz_m: Floats
+    """(K, 3) centre and mean height of the points, upright frame."""
+    radius_m: Floats
+    noise_m: Floats
+    on: Ints
+    inside: Ints
+    arc_rad: Floats
+    range_m: Floats
+
+
+def fit_slices(
+    voxels: Voxels, order: Ints, begin: Ints, low: Floats, spacing_m: float, layer_m: float, config: DetectorConfig
+) -> Circles:
+    """Return the circles found in every cluster of every layer (several where a cluster holds several)."""
+    clusters = int(np.count_nonzero(np.diff(begin) >= config.min_slice_points))
+    out = np.zeros((2 * clusters + 64, _COLUMNS))
+    rows = int(
+        _all_slices(
+            voxels.xyz_m, voxels.ray_m, order, begin, float(low[2]), layer_m, config.range_noise_per_m,
+            config.surface_noise_m, spacing_m, config.min_radius_m, config.max_radius_m, config.min_slice_points,
+            config.trials, config.seed, out,
+        )
+    )  # fmt: skip
+    out = out[:rows]
+    keep = (out[:, 7] <= 0.6 * out[:, 6]) & (out[:, 8] >= 0.7 * config.min_arc_rad)
+    keep &= (out[:, 5] <= 0.5 * out[:, 4]) | (out[:, 9] > 0.0)
+    out = out[keep]
+    return Circles(
+        out[:, 0].astype(np.int64), np.ascontiguousarray(out[:, 1:4]), np.ascontiguousarray(out[:, 4]), out[:, 5].copy(),
+        out[:, 6].astype(np.int64), out[:, 7].astype(np.int64), out[:, 8].copy(), out[:, 9].copy(),
+    )  # fmt: skip

@@ -1,0 +1,114 @@
+"""What tells a trunk from a bush, a wall, a table leg, a person or a post; each check names its reason."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from services.detector.config import DetectorConfig
+from services.detector.cylinders import Cylinder
+from services.detector.model import Floats, Ground, Views
+from services.detector.upright import Upright
+from services.detector.voxels import Voxels
+
+_BAND_M = 0.15
+
+
+def axis_at(cylinder: Cylinder, z_m: float) -> Floats:
+    """Return the axis point (3,) at a height z of the upright frame."""
+    return cylinder.at_m + cylinder.axis * ((z_m - cylinder.at_m[2]) / cylinder.axis[2])
+
+
+def base_point(cylinder: Cylinder, ground: Ground) -> Floats:
+    """Return where the axis meets the ground (3,), upright frame (a few fixed-point steps)."""
+    z = cylinder.z_low_m
+    for _ in range(6):
+        p = axis_at(cylinder, z)
+        z = ground.height_m(float(p[0]), float(p[1]))
+    return axis_at(cylinder, z)
+
+
+def shape_fault(cylinder: Cylinder, low_m: float, high_m: float, span_m: float, config: DetectorConfig) -> str:
+    """Return why this cylinder is no trunk, or an empty text. Heights are above ground."""
+    c = cylinder
+    lean = float(np.arccos(min(1.0, c.axis[2])))
+    noise_limit = 0.30 * c.radius_m + 0.006
+    faults = (
+        (lean > config.max_lean_rad, f"leans {np.degrees(lean):.0f} deg"),
+        (not config.min_radius_m <= c.radius_m <= config.max_radius_m, f"radius {c.radius_m:.3f} m is out of range"),
+        (high_m - low_m < span_m, f"seen over {high_m - low_m:.2f} m of height only, {span_m:.2f} needed"),
+        (c.cover < config.min_cover, f"only {100 * c.cover:.0f} % of its height shows a surface"),
+        (c.arc_rad < config.min_arc_rad, f"only {np.degrees(c.arc_rad):.0f} deg of arc"),
+        (c.inside > 0.35 * c.points, f"{c.inside} points inside for {c.points} on the surface: a bush"),
+        (c.around > 2.0 * c.points, f"{c.around} points around for {c.points} on the surface: a bush"),
+        (c.range_m == 0.0 and c.noise_m > noise_limit, f"surface scatters {100 * c.noise_m:.1f} cm: a bush"),
+        (c.range_m > 0.0 and c.scale > 3.0, f"surface scatters {c.scale:.1f} times the sensor's noise: a bush"),
+    )
+    return next((text for bad, text in faults if bad), "")
+
+
+@njit(cache=True, nogil=True)
+def _top_band(
+    xyz: Floats,
+    x: float,
+    y: float,
+    z: float,
+    sx: float,
+    sy: float,
+    r: float,
+    taper: float,
+    z_from: float,
+    bands: Floats,
+) -> None:
+    """Count points near the surface of the prolonged cylinder in bands of 15 cm above ``z_from``."""
+    for i in range(xyz.shape[0]):
+        k = int((xyz[i, 2] - z_from) / _BAND_M) if xyz[i, 2] >= z_from else -1
+        if k < 0 or k >= bands.shape[0]:
+            continue
+        dz = xyz[i, 2] - z
+        d = np.sqrt((xyz[i, 0] - x - sx * dz) ** 2 + (xyz[i, 1] - y - sy * dz) ** 2)
+        if abs(d - max(r + taper * dz, 0.01)) < 0.06 + 0.3 * r:
+            bands[k] += 1.0
+
+
+def prolonged_top_m(cylinder: Cylinder, above: Voxels, z_limit_m: float) -> float:
+    """Return the z (upright frame) up to which the trunk goes on without a gap of more than 0.45 m."""
+    c = cylinder
+    z_from = c.z_high_m
+    count = int(max(0.0, (z_limit_m - z_from) / _BAND_M))
+    if count == 0 or len(above.xyz_m) == 0:
+        return z_from
+    bands = np.zeros(count)
+    sx, sy = c.axis[:2] / c.axis[2]
+    _top_band(above.xyz_m, c.at_m[0], c.at_m[1], c.at_m[2], sx, sy, c.radius_m, c.taper, z_from, bands)
+    top, gap = z_from, 0
+    for k in range(count):
+        if bands[k] >= 2:
+            top, gap = z_from + (k + 1) * _BAND_M, 0
+        else:
+            gap += 1
+            if gap > 3:
+                break
+    return top
+
+
+def space_above_was_seen(p_m: Floats, views: Views | None, frame: Upright, above: Voxels, z_top_m: float) -> bool:
+    """Tell whether the space at an upright point above a column's top was looked at.
+
+    With posed views: some camera had it in its field of view and within reach. Without: the cloud shows other things
+    within 1.5 m in the plan and at those heights, so the sensor did look up there.
+    """
+    if views is not None and views.rotations is not None and views.tan_half is not None:
+        q = frame.to_input(p_m)
+        local = np.einsum("vji,vj->vi", views.rotations, q - views.origins_m)
+        z = local[:, 2]
+        tan_x, tan_y = views.tan_half
+        seen = (z > 0.5) & (z < 0.9 * views.max_range_m)
+        seen &= (np.abs(local[:, 0]) < 0.9 * tan_x * z) & (np.abs(local[:, 1]) < 0.95 * tan_y * z)
+        return bool(seen.any())
+    if views is not None or len(above.xyz_m) == 0:
+        return False
+    d = above.xyz_m[:, :2] - p_m[:2]
+    near = (d**2).sum(axis=1) < 1.5**2
+    higher = (above.xyz_m[:, 2] > z_top_m + 0.4) & (above.xyz_m[:, 2] < z_top_m + 1.5)
+    return bool(np.count_nonzero(near & higher) >= 20)

@@ -1,0 +1,243 @@
+"""One joint fit per candidate: a leaning, tapering cylinder through all points of its slices.
+
+Parameters: axis ``(x0, y0)`` at the reference height, its slopes, radius and taper. Points are sheared along the
+current axis and the plan is stretched so that the cross-section of a leaning trunk is a circle again. Residuals along
+the ray as in ``arcs``; robust Gauss-Newton (Tukey); the covariance is the inverse normal matrix times the observed scale.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from services.common.geometry import rotation_aligning
+from services.detector.arcs import BINS, point_sigma, residual, solve
+from services.detector.config import DetectorConfig
+from services.detector.model import Floats, Ints
+from services.detector.stacks import Stack
+from services.detector.voxels import Voxels
+
+_PRIOR_SLOPE = 0.02
+"""Standard deviation of the lean left over after the stack's line was taken out, metres per metre."""
+_PRIOR_TAPER = 0.008
+"""Standard deviation of the taper about its mean, metres of radius per metre of height."""
+_MEAN_TAPER = -0.006
+_CORRELATED = 25.0
+"""Neighbouring points share fixed-pattern noise and bark: so many of them count as one in the covariance."""
+
+
+@dataclass(frozen=True, slots=True)
+class Cylinder:
+    """A fitted trunk in the upright frame."""
+
+    at_m: Floats
+    """(3,): a point of the axis, at the middle of the points."""
+    axis: Floats
+    """(3,), unit, upward."""
+    radius_m: float
+    """At ``at_m``."""
+    taper: float
+    """Change of radius per metre along the axis."""
+    noise_m: float
+    scale: float
+    """Observed over expected noise."""
+    points: int
+    inside: int
+    around: int
+    """Points within 10 cm outside the surface."""
+    arc_rad: float
+    z_low_m: float
+    z_high_m: float
+    cover: float
+    """Share of 10 cm bands between low and high with points on the surface."""
+    range_m: float
+    """Mean distance it was seen from, 0 where views are unknown."""
+    covariance: Floats
+    """(6, 6) of x, y (at ``at_m``), the two slopes, radius, taper."""
+
+
+@njit(cache=True, nogil=True)
+def _near(
+    xyz: Floats, x: float, y: float, z: float, sx: float, sy: float, reach: float, z0: float, z1: float, out: Ints
+) -> int:
+    n = 0
+    for i in range(xyz.shape[0]):
+        if not z0 <= xyz[i, 2] <= z1:
+            continue
+        dz = xyz[i, 2] - z
+        dx, dy = xyz[i, 0] - x - sx * dz, xyz[i, 1] - y - sy * dz
+        if dx * dx + dy * dy < reach * reach:
+            out[n] = i
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _fit(
+    P: Floats, U: Floats, G: Floats, W: Floats, x: Floats, k_range: float, surface: float, start: float, prior: Floats,
+    normal: Floats,
+) -> float:  # fmt: skip
+    """Improve ``x`` = (cx, cy, slope x, slope y, radius, taper) in the axis frame; return the scale factor."""
+    n = P.shape[0]
+    J, K, A, y, step = np.empty(3), np.empty(6), np.empty((6, 6)), np.empty(6), np.empty(6)
+    e, sigma, size = np.empty(n), np.empty(n), np.empty(n)
+    scale = start
+    for _ in range(15):
+        near = 0
+        for i in range(n):
+            z = P[i, 2]
+            cx, cy, r = x[0] + x[2] * z, x[1] + x[3] * z, max(x[4] + x[5] * z, 0.005)
+            s = ((cx - P[i, 0]) * U[i, 1] - (cy - P[i, 1]) * U[i, 0]) / r
+            sigma[i] = point_sigma(s, G[i], U[i, 0] != 0.0 or U[i, 1] != 0.0, k_range, surface)
+            e[i] = residual(P[i, 0], P[i, 1], U[i, 0], U[i, 1], cx, cy, r, J) / sigma[i]
+            if abs(e[i]) < 4.5 * scale:
+                size[near] = abs(e[i])
+                near += 1
+        if near < 10:
+            return -1.0
+        scale = max(1.0, 1.4826 * np.median(size[:near]))
+        A[:] = 0.0
+        y[:] = 0.0
+        for i in range(n):
+            t = e[i] / (4.0 * scale)
+            if abs(t) >= 1.0:
+                continue
+            z = P[i, 2]
+            cx, cy, r = x[0] + x[2] * z, x[1] + x[3] * z, max(x[4] + x[5] * z, 0.005)
+            residual(P[i, 0], P[i, 1], U[i, 0], U[i, 1], cx, cy, r, J)
+            K[0], K[1], K[2], K[3], K[4], K[5] = J[0], J[1], J[0] * z, J[1] * z, J[2], J[2] * z
+            w = W[i] * (1.0 - t * t) ** 2 / (sigma[i] * scale)
+            for a in range(6):
+                y[a] -= w * e[i] * K[a] / scale
+                for b in range(a + 1):
+                    A[a, b] += w * K[a] * K[b] / (sigma[i] * scale)
+        for a in range(6):
+            for b in range(a):
+                A[b, a] = A[a, b]
+        for a in range(6):
+            A[a, a] += prior[a, 1]
+            y[a] += prior[a, 1] * (prior[a, 0] - x[a])
+        normal[:] = A
+        solve(A, y, step)
+        size_step = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[4] ** 2)
+        limit = min(1.0, 0.3 * x[4] / max(size_step, 1e-12))
+        for a in range(6):
+            x[a] += limit * step[a]
+        x[4] = max(x[4], 0.008)
+        if size_step < 2e-5:
+            break
+    return scale
+
+
+@njit(cache=True, nogil=True)
+def _assess(
+    P: Floats, U: Floats, G: Floats, x: Floats, scale: float, k_range: float, surface: float, on: Ints, counts: Floats,
+    bands: Ints, z_low: float,
+) -> None:  # fmt: skip
+    """Fill counts: on, inside, around, arc, noise, mean range. Mark the points on the surface; count them per band."""
+    bins = np.zeros(BINS)
+    J = np.empty(3)
+    counts[:] = 0.0
+    for i in range(P.shape[0]):
+        z = P[i, 2]
+        cx, cy, r = x[0] + x[2] * z, x[1] + x[3] * z, max(x[4] + x[5] * z, 0.005)
+        dx, dy = P[i, 0] - cx, P[i, 1] - cy
+        ray = U[i, 0] != 0.0 or U[i, 1] != 0.0
+        s = (dy * U[i, 0] - dx * U[i, 1]) / r
+        sigma = scale * point_sigma(s, G[i], ray, k_range, surface)
+        e = residual(P[i, 0], P[i, 1], U[i, 0], U[i, 1], cx, cy, r, J)
+        d = np.sqrt(dx * dx + dy * dy)
+        on[i] = 0
+        if abs(e) < 3.0 * sigma:
+            on[i] = 1
+            counts[0] += 1
+            counts[4] += e * e
+            counts[5] += G[i]
+            bins[min(BINS - 1, int((np.arctan2(dy, dx) + np.pi) / (2.0 * np.pi) * BINS))] += 1.0
+            band = int((z - z_low) / 0.1)
+            if 0 <= band < bands.shape[0]:
+                bands[band] += 1
+        elif d < r:
+            counts[1] += 1
+        elif d < r + 0.1:
+            counts[2] += 1
+    few = 0.02 * counts[0] / 10.0
+    for b in range(BINS):
+        if bins[b] > few:
+            counts[3] += 2.0 * np.pi / BINS
+    if counts[0] > 0:
+        counts[4] = np.sqrt(counts[4] / counts[0])
+        counts[5] /= counts[0]
+
+
+def _axis_frame(voxels: Voxels, near: Ints, at: Floats, R: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return points, unit rays in the plan and ranges of the near voxels in the frame whose z is the axis."""
+    P = (voxels.xyz_m[near] - at) @ R.T
+    ray = voxels.ray_m[near]
+    G = np.sqrt((ray**2).sum(axis=1))
+    flat = (ray @ R.T)[:, :2]
+    length = np.sqrt((flat**2).sum(axis=1, keepdims=True))
+    U = np.where(length > 1e-6, flat / np.maximum(length, 1e-9), 0.0)
+    return np.ascontiguousarray(P), np.ascontiguousarray(U), G
+
+
+def fit_cylinder(voxels: Voxels, stack: Stack, config: DetectorConfig) -> Cylinder | None:
+    """Return the joint fit of a candidate, or None when too few points remain."""
+    at, slope, radius = stack.at_m.copy(), stack.slope.copy(), stack.radius_m
+    far = np.median(voxels.ray_m[:, :2] ** 2) > 0.0
+    buffer = np.empty(len(voxels.xyz_m), dtype=np.int64)
+    x = np.zeros(6)
+    R, normal = np.eye(3), np.zeros((6, 6))
+    P = U = np.zeros((0, 3))
+    G = np.zeros(0)
+    scale = 1.0
+    for turn in range(2):
+        reach = radius + max(0.12, 0.4 * radius) + (0.1 if far else 0.0)
+        z0, z1 = stack.z_low_m - 0.15, stack.z_high_m + 0.15
+        n = int(_near(voxels.xyz_m, at[0], at[1], at[2], slope[0], slope[1], reach, z0, z1, buffer))
+        if n < 15:
+            return None
+        R = rotation_aligning((slope[0], slope[1], 1.0), (0.0, 0.0, 1.0))
+        P, U, G = _axis_frame(voxels, buffer[:n], at, R)
+        mean_taper = _MEAN_TAPER
+        x[:] = (0.0, 0.0, 0.0, 0.0, radius, mean_taper if turn == 0 else x[5])
+        prior = np.array([
+            [0.0, 1e-6], [0.0, 1e-6], [0.0, 1.0 / (4 * _PRIOR_SLOPE) ** 2], [0.0, 1.0 / (4 * _PRIOR_SLOPE) ** 2],
+            [radius, 1e-6], [mean_taper, 1.0 / _PRIOR_TAPER**2],
+        ])  # fmt: skip
+        W = np.full(n, 1.0 / _CORRELATED)
+        scale = float(
+            _fit(P, U, G, W, x, config.range_noise_per_m, config.surface_noise_m, 3.0 if turn == 0 else scale, prior, normal)
+        )  # fmt: skip
+        if scale < 0.0:
+            return None
+        at = at + R.T @ np.array([x[0], x[1], 0.0])
+        axis = R.T @ np.array([x[2], x[3], 1.0])
+        slope, radius = axis[:2] / axis[2], float(x[4])
+        if not 0.01 <= radius <= 1.5 or np.hypot(*slope) > 1.5:
+            return None
+    return _measured(P, U, G, x, scale, R, at, slope, normal, config)
+
+
+def _measured(
+    P: Floats, U: Floats, G: Floats, x: Floats, scale: float, R: Floats, at: Floats, slope: Floats, normal: Floats,
+    config: DetectorConfig,
+) -> Cylinder | None:  # fmt: skip
+    on, counts = np.zeros(len(P), dtype=np.int64), np.zeros(6)
+    z_low = float(P[:, 2].min())
+    bands = np.zeros(int((P[:, 2].max() - z_low) / 0.1) + 1, dtype=np.int64)
+    _assess(P, U, G, x, scale, config.range_noise_per_m, config.surface_noise_m, on, counts, bands, z_low)
+    held = np.flatnonzero(bands >= 3)
+    if len(held) == 0:
+        return None
+    axis = np.array([slope[0], slope[1], 1.0]) / np.sqrt(1.0 + float(slope @ slope))
+    low, high = z_low + 0.1 * held[0], min(z_low + 0.1 * (held[-1] + 1), float(P[:, 2].max()))
+    covariance = np.linalg.inv(normal)
+    return Cylinder(
+        at_m=at, axis=axis, radius_m=float(x[4]), taper=float(x[5]), noise_m=float(counts[4]), scale=scale,
+        points=int(counts[0]), inside=int(counts[1]), around=int(counts[2]), arc_rad=min(float(counts[3]), 2.0 * np.pi),
+        z_low_m=float(at[2] + low * axis[2]), z_high_m=float(at[2] + high * axis[2]),
+        cover=len(held) / (held[-1] - held[0] + 1), range_m=float(counts[5]), covariance=covariance,
+    )  # fmt: skip
