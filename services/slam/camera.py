@@ -1,0 +1,43 @@
+"""The camera as the kernels need it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.camera import Intrinsics
+from services.slam.config import SlamConfig
+from services.slam.features import grid_size
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraModel:
+    """Constants of one camera with one configuration."""
+
+    array: F64
+    """(5,) fx, fy, cx, cy, and fx times the virtual baseline."""
+    width: float
+    height: float
+    cols: int
+    """Columns of the search grid."""
+    scales: F64
+    """(levels,) scale of each octave."""
+    variance: F64
+    """(levels,) variance of u and v by octave, pixels squared."""
+    disparity_info: float
+    """Inverse variance of the virtual disparity."""
+
+
+def camera_model(intrinsics: Intrinsics, config: SlamConfig) -> CameraModel:
+    """Return the constants."""
+    i = intrinsics
+    scales = config.scale ** np.arange(config.levels, dtype=float)
+    return CameraModel(
+        array=np.array([i.fx, i.fy, i.cx, i.cy, i.fx * config.baseline_m]),
+        width=float(i.width), height=float(i.height), cols=grid_size(i)[0], scales=scales, variance=scales**2,
+        disparity_info=1.0 / config.disparity_sigma_px**2,
+    )  # fmt: skip

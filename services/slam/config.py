@@ -1,0 +1,40 @@
+"""Configuration of the slam service."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class SlamConfig(BaseModel):
+    """Everything about slam that may be set; lengths in metres, image lengths in pixels of the full size image."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    features: int = Field(default=1000, ge=100, le=4000)
+    """Features kept per frame."""
+    levels: int = Field(default=8, ge=1, le=12)
+    scale: float = Field(default=1.2, gt=1.0, le=2.0)
+    fast_threshold: int = Field(default=19, ge=5, le=60)
+    fast_threshold_low: int = Field(default=7, ge=2, le=60)
+    """Where texture is poor."""
+    min_depth_m: float = Field(default=0.3, gt=0)
+    max_depth_m: float = Field(default=8.0, gt=0)
+    """Depth beyond this makes no map point: the sensor's range."""
+    baseline_m: float = Field(default=0.08, gt=0)
+    """Virtual stereo baseline: depth enters as the disparity ``fx * baseline / z``, whose noise is constant."""
+    disparity_sigma_px: float = Field(default=0.6, gt=0)
+    """Noise of that disparity."""
+    min_inliers: int = Field(default=25, ge=6)
+    """Fewer matches of the map than this: lost."""
+    keyframe_ratio: float = Field(default=0.75, gt=0, le=1)
+    """A new keyframe when fewer than this share of the reference keyframe's points is tracked."""
+    keyframe_interval_max: int = Field(default=20, ge=1)
+    """A new keyframe after so many frames in any case when the view has changed."""
+    close_tracked_min: int = Field(default=100, ge=0)
+    close_untracked_max: int = Field(default=70, ge=0)
+    """A keyframe at once when fewer close points are tracked and more are not."""
+    window_keyframes: int = Field(default=12, ge=2)
+    """Keyframes that a local bundle adjustment moves."""
+    loop_closing: bool = True
+    relocalise: bool = True
+    accel_window_s: float = Field(default=0.5, ge=0)

@@ -1,0 +1,169 @@
+"""ORB features of one image, spread evenly, with depth: what all later stages work on.
+
+ORB: Rublee, Rabaud, Konolige and Bradski, "ORB: an efficient alternative to SIFT or SURF" (2011).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from schemas.camera import Intrinsics
+from services.slam.config import SlamConfig
+
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+U8 = NDArray[np.uint8]
+
+CELL_PX = 20.0
+"""Side of the search grid's cells."""
+_EDGE_PX = 19
+"""No feature nearer to the image's edge: the descriptor's patch would leave it."""
+
+
+@dataclass(slots=True)
+class Features:
+    """Features of one image, in one order for all arrays (N first), with the grid that finds them by place."""
+
+    uv: F64
+    """(N, 2) undistorted pixels."""
+    octave: I32
+    angle: F64
+    """(N,) radians."""
+    desc: NDArray[np.uint64]
+    """(N, 4)."""
+    depth: F64
+    """(N,) metres, 0 = none."""
+    disparity: F64
+    """(N,) fx * baseline / depth, 0 = none."""
+    cell_start: I32
+    cell_items: I32
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+
+@njit(cache=True, nogil=True)
+def spread(xy: F64, response: F64, octave: I32, keep: int, width: int, height: int) -> NDArray[np.int64]:
+    """Return at most ``keep`` indices, strong and even: round by round the next best of each image cell.
+
+    Cells are about as many as half of the features wanted; ties fall to the earlier index.
+    """
+    n = len(xy)
+    side = max(8.0, np.sqrt(width * height / max(0.5 * keep, 1.0)))
+    cols, rows = int(width / side) + 1, int(height / side) + 1
+    order = np.argsort(-response, kind="mergesort")
+    rank = np.empty(n, np.int64)
+    filled = np.zeros(cols * rows, np.int64)
+    for index in order:
+        cell = int(xy[index, 1] / side) * cols + int(xy[index, 0] / side)
+        rank[index] = filled[cell]
+        filled[cell] += 1
+    out = np.empty(min(keep, n), np.int64)
+    count = 0
+    level = 0
+    while count < len(out):
+        for index in order:
+            if rank[index] == level and count < len(out):
+                out[count] = index
+                count += 1
+        level += 1
+    return np.sort(out)
+
+
+@njit(cache=True, nogil=True)
+def sample_depth(depth_m: NDArray[np.float32], xy: F64, low_m: float, high_m: float) -> F64:
+    """Return the depth (N,) at pixels: the centre's, or 0 outside of the range or beside a hole or a jump."""
+    height, width = depth_m.shape
+    out = np.zeros(len(xy))
+    for i in range(len(xy)):
+        c, r = int(xy[i, 0] + 0.5), int(xy[i, 1] + 0.5)
+        if c < 1 or r < 1 or c >= width - 1 or r >= height - 1:
+            continue
+        z = depth_m[r, c]
+        if z < low_m or z > high_m:
+            continue
+        out[i] = z
+    return out
+
+
+@njit(cache=True, nogil=True)
+def grid_of(uv: F64, cols: int, rows: int) -> tuple[I32, I32]:
+    """Return the search grid as (cell starts, indices by cell); places outside of the image go to its border cells."""
+    n = len(uv)
+    cell = np.empty(n, np.int32)
+    start = np.zeros(cols * rows + 1, np.int32)
+    for i in range(n):
+        c = min(max(int(uv[i, 0] / CELL_PX), 0), cols - 1)
+        r = min(max(int(uv[i, 1] / CELL_PX), 0), rows - 1)
+        cell[i] = r * cols + c
+        start[cell[i] + 1] += 1
+    for k in range(cols * rows):
+        start[k + 1] += start[k]
+    at = start[:-1].copy()
+    items = np.empty(n, np.int32)
+    for i in range(n):
+        items[at[cell[i]]] = i
+        at[cell[i]] += 1
+    return start, items
+
+
+def grid_size(intrinsics: Intrinsics) -> tuple[int, int]:
+    """Return columns and rows of the search grid."""
+    return int(np.ceil(intrinsics.width / CELL_PX)), int(np.ceil(intrinsics.height / CELL_PX))
+
+
+class Extractor:
+    """Makes Features of images of one camera."""
+
+    def __init__(self, intrinsics: Intrinsics, config: SlamConfig) -> None:
+        import cv2
+
+        self._intrinsics = intrinsics
+        self._config = config
+        self._orb: Any = cv2.ORB_create(
+            nfeatures=int(2.0 * config.features), scaleFactor=config.scale, nlevels=config.levels,
+            edgeThreshold=_EDGE_PX, patchSize=31, fastThreshold=config.fast_threshold_low,
+        )  # fmt: skip
+        self._K = np.array([[intrinsics.fx, 0.0, intrinsics.cx], [0.0, intrinsics.fy, intrinsics.cy], [0.0, 0.0, 1.0]])
+        self._distortion = np.array([intrinsics.k1, intrinsics.k2, intrinsics.p1, intrinsics.p2, intrinsics.k3])
+        self._cols, self._rows = grid_size(intrinsics)
+
+    def extract(self, grey: U8, depth_m: NDArray[np.float32]) -> Features:
+        """Return the features of an image (H, W) with its depth (H, W)."""
+        keypoints, descriptors = self._orb.detectAndCompute(grey, None)
+        if not keypoints:
+            return self._empty()
+        table = np.array([(*k.pt, k.response, k.angle, k.octave) for k in keypoints])
+        octave = table[:, 4].astype(np.int32)
+        height, width = grey.shape
+        pick = spread(table[:, :2], table[:, 2], octave, self._config.features, width, height)
+        xy = np.ascontiguousarray(table[pick, :2])
+        desc = np.ascontiguousarray(descriptors[pick]).view(np.uint64)
+        depth = sample_depth(depth_m, xy, self._config.min_depth_m, 10.0 * self._config.max_depth_m)
+        uv = self.undistort(xy)
+        return self._build(uv, octave[pick], np.deg2rad(table[pick, 3]), desc, depth)
+
+    def undistort(self, xy: F64) -> F64:
+        """Return undistorted pixels (N, 2)."""
+        if not self._intrinsics.distorted or not len(xy):
+            return xy
+        import cv2
+
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-9)
+        out = cv2.undistortPoints(xy[:, None, :], self._K, self._distortion, None, None, self._K, criteria)
+        return np.ascontiguousarray(out[:, 0, :])
+
+    def _empty(self) -> Features:
+        zero = np.zeros(0)
+        return self._build(np.zeros((0, 2)), np.zeros(0, np.int32), zero, np.zeros((0, 4), np.uint64), np.zeros(0))
+
+    def _build(self, uv: F64, octave: I32, angle: F64, desc: NDArray[np.uint64], depth: F64) -> Features:
+        bf = self._intrinsics.fx * self._config.baseline_m
+        disparity = np.where(depth > 0.0, bf / np.where(depth > 0.0, depth, 1.0), 0.0)
+        start, items = grid_of(uv, self._cols, self._rows)
+        return Features(uv, octave, angle, desc, depth, disparity, start, items)

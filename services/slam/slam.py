@@ -1,0 +1,250 @@
+"""RGB-D SLAM: one call per frame. Reads as the method: extract, predict, follow, join the map, perhaps a keyframe.
+
+After Mur-Artal and Tardos, "ORB-SLAM2" (2017), built anew for turns on the spot: points straight from depth up to the
+sensor's range, temporary points of the last frame, keyframes at once when close points run out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.camera import Intrinsics
+from schemas.slam import GraphReason, SlamStatus
+from services.common.geometry import inverse, orthonormal, pose
+from services.slam import gravity
+from services.slam.atlas import Atlas
+from services.slam.camera import camera_model
+from services.slam.config import SlamConfig
+from services.slam.features import Extractor, Features
+from services.slam.mapping import Mapping
+from services.slam.tracking import Tracked, Tracking, moved, still_points
+
+F64 = NDArray[np.float64]
+
+_MIN_START_POINTS = 100
+"""Features with depth that a first keyframe needs."""
+
+
+@dataclass(frozen=True, slots=True)
+class NewKeyframe:
+    """A keyframe that has just joined the map."""
+
+    keyframe_id: int
+    T_map_camera: F64
+
+
+@dataclass(frozen=True, slots=True)
+class GraphUpdate:
+    """All keyframes of the map and where they stand now."""
+
+    version: int
+    reason: GraphReason
+    nodes: tuple[tuple[int, F64], ...]
+    """(keyframe id, T_map_camera)."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackResult:
+    """What slam knows after one frame."""
+
+    stamp_ns: int
+    status: SlamStatus
+    T_map_camera: F64 | None
+    covariance: F64 | None
+    """(6, 6) of (x, y, z, rx, ry, rz), left perturbation in the map frame."""
+    keyframe_id: int | None
+    T_keyframe_camera: F64 | None
+    new_keyframes: list[NewKeyframe]
+    graph: GraphUpdate | None
+    reset_counter: int
+    graph_version: int
+    inliers: int
+    up_sigma_rad: float
+
+
+@dataclass(slots=True)
+class _Log:
+    """Every tracked frame relative to its keyframe."""
+
+    stamp_ns: list[int] = field(default_factory=list)
+    keyframe: list[int] = field(default_factory=list)
+    T_keyframe_camera: list[F64] = field(default_factory=list)
+
+
+class Slam:
+    """Tracks one camera and keeps one map; deterministic, knows no clock and no bus."""
+
+    def __init__(self, intrinsics: Intrinsics, config: SlamConfig, map_id: str = "map-1") -> None:
+        self.intrinsics = intrinsics
+        self.config = config
+        self.map_id = map_id
+        camera = camera_model(intrinsics, config)
+        self.camera = camera
+        self._extractor = Extractor(intrinsics, config)
+        cells = camera.cols * int(np.ceil(intrinsics.height / 20.0))
+        self.atlas = Atlas(config.features, cells, config.scale, config.levels)
+        self.mapping = Mapping(self.atlas, camera, config)
+        self.tracking = Tracking(self.atlas, camera, config)
+        self.reset_counter = 0
+        self.graph_version = 0
+        self.up_sigma_rad = gravity.SIGMA_UNKNOWN_RAD
+        self._last: Tracked | None = None
+        self._step = np.eye(4)
+        """T_camera_lastcamera of the last two tracked frames: the constant velocity."""
+        self._reference = -1
+        self._anchor: F64 = np.eye(4)
+        """T_keyframe_camera of the last tracked frame."""
+        self._since_keyframe = 0
+        self._log = _Log()
+
+    def track(
+        self,
+        stamp_ns: int,
+        grey: NDArray[np.uint8],
+        depth_m: NDArray[np.float32],
+        accel_camera: F64 | None = None,
+        attitude_up_camera: F64 | None = None,
+    ) -> TrackResult:
+        """Locate one frame: ``grey`` (H, W), ``depth_m`` (H, W) metres, 0 = none.
+
+        ``accel_camera`` (3,) m/s^2 in the camera's frame (at rest up times 9.81), ``attitude_up_camera`` (3,) up in the
+        camera's frame as the autopilot tells it.
+        """
+        features = self._extractor.extract(grey, depth_m)
+        if self.graph_version == 0:
+            return self._initialise(stamp_ns, features, accel_camera, attitude_up_camera)
+        frame = self._locate(features)
+        if frame is None:
+            return self._lost(stamp_ns)
+        return self._accept(stamp_ns, frame)
+
+    def _initialise(self, stamp_ns: int, features: Features, accel: F64 | None, attitude: F64 | None) -> TrackResult:
+        if np.count_nonzero(features.depth > 0.0) < _MIN_START_POINTS:
+            return self._result(stamp_ns, "initialising", None, [], None)
+        up = attitude if attitude is not None else accel
+        if up is not None:
+            self.up_sigma_rad = gravity.SIGMA_ACCEL_RAD if attitude is None else gravity.SIGMA_ATTITUDE_RAD
+        T_camera_map = inverse(gravity.first_pose(up))
+        frame = Tracked(
+            features, np.ascontiguousarray(T_camera_map[:3, :3]), T_camera_map[:3, 3].copy(),
+            np.full(len(features), -1, np.int32), len(features), np.eye(6) * 1e8,
+        )  # fmt: skip
+        return self._accept(stamp_ns, frame)
+
+    def _locate(self, features: Features) -> Tracked | None:
+        """Return the frame located in the map, or None."""
+        last = self._last
+        if last is None:
+            return None
+        predicted = self._step @ pose(last.R, last.t)
+        R = orthonormal(predicted[:3, :3])
+        frame = self.tracking.follow(last, features, np.ascontiguousarray(R), predicted[:3, 3].copy())
+        if frame is None:
+            return None
+        joined = self.tracking.join_map(frame)
+        if joined is None or joined[0].inliers < self.config.min_inliers:
+            return None
+        return joined[0]
+
+    def _accept(self, stamp_ns: int, frame: Tracked) -> TrackResult:
+        """A frame has its pose: remember it, and make a keyframe of it when the map needs one."""
+        new: list[NewKeyframe] = []
+        graph = None
+        if self._last is not None:
+            self._step = pose(frame.R, frame.t) @ inverse(pose(self._last.R, self._last.t))
+        self._since_keyframe += 1
+        if self._needs_keyframe(frame):
+            k = self.mapping.insert(frame.features, frame.R, frame.t, frame.point)
+            kf = self.atlas.keyframes
+            frame.R, frame.t = kf.R[k].copy(), kf.t[k].copy()
+            frame.point = kf.point[k, : len(frame.features)].copy()
+            self._since_keyframe = 0
+            self.graph_version += 1
+            new.append(NewKeyframe(int(kf.serial[k]), inverse(pose(frame.R, frame.t))))
+            graph = self._graph("local_ba" if self.graph_version > 1 else "keyframe")
+        self._set_anchor(frame)
+        self._last = frame
+        self._log.stamp_ns.append(stamp_ns)
+        self._log.keyframe.append(self._reference)
+        self._log.T_keyframe_camera.append(self._anchor)
+        return self._result(stamp_ns, "tracking", frame, new, graph)
+
+    def _set_anchor(self, frame: Tracked) -> None:
+        from services.slam.atlas import shared_counts
+
+        kf = self.atlas.keyframes
+        counts = shared_counts(self.atlas.points, frame.point, len(kf.n))
+        k = int(np.lexsort((-kf.serial, -counts))[0])
+        self._reference = int(kf.serial[k])
+        self._anchor = pose(kf.R[k], kf.t[k]) @ inverse(pose(frame.R, frame.t))
+
+    def _needs_keyframe(self, frame: Tracked) -> bool:
+        if self.graph_version == 0:
+            return True
+        config, atlas = self.config, self.atlas
+        f = frame.features
+        close = (f.depth >= config.min_depth_m) & (f.depth <= config.max_depth_m)
+        tracked = int(np.count_nonzero(close & (frame.point >= 0)))
+        untracked = int(np.count_nonzero(close & (frame.point < 0)))
+        if tracked < config.close_tracked_min and untracked > config.close_untracked_max:
+            return True
+        k = atlas.slot_of(self._reference)
+        ids = atlas.keyframes.point[k]
+        ids = ids[ids >= 0]
+        least = 3 if len(atlas.slots) > 2 else 1
+        reference = int(np.count_nonzero(atlas.points.n[ids] >= least))
+        return frame.inliers < config.keyframe_ratio * reference
+
+    def _lost(self, stamp_ns: int) -> TrackResult:
+        return self._result(stamp_ns, "lost", None, [], None)
+
+    def _graph(self, reason: GraphReason) -> GraphUpdate:
+        return GraphUpdate(self.graph_version, reason, tuple(self.keyframe_poses().items()))
+
+    def _result(
+        self,
+        stamp_ns: int,
+        status: SlamStatus,
+        frame: Tracked | None,
+        new: list[NewKeyframe],
+        graph: GraphUpdate | None,
+    ) -> TrackResult:
+        located = frame is not None
+        return TrackResult(
+            stamp_ns=stamp_ns, status=status,
+            T_map_camera=inverse(pose(frame.R, frame.t)) if frame is not None else None,
+            covariance=map_covariance(frame) if frame is not None else None,
+            keyframe_id=self._reference if located else None,
+            T_keyframe_camera=self._anchor if located else None,
+            new_keyframes=new, graph=graph, reset_counter=self.reset_counter, graph_version=self.graph_version,
+            inliers=frame.inliers if frame is not None else 0, up_sigma_rad=self.up_sigma_rad,
+        )  # fmt: skip
+
+    def keyframe_poses(self) -> dict[int, F64]:
+        """Return T_map_camera (4, 4) of each living keyframe by id, in order of id."""
+        kf = self.atlas.keyframes
+        return {int(kf.serial[k]): inverse(pose(kf.R[k], kf.t[k])) for k in self.atlas.slots}
+
+    def final_trajectory(self) -> list[tuple[int, F64]]:
+        """Return (stamp_ns, T_map_camera) of each tracked frame, placed by what is now known of its keyframe."""
+        log = self._log
+        rows = zip(log.stamp_ns, log.keyframe, log.T_keyframe_camera, strict=True)
+        return [(stamp, self.mapping.keyframe_pose(serial) @ T) for stamp, serial, T in rows]
+
+
+def map_covariance(frame: Tracked) -> F64:
+    """Return the covariance (6, 6) of T_map_camera for a left perturbation in the map frame.
+
+    With T_camera_map -> exp(delta) T_camera_map, the camera's centre moves by -R^T v and its rotation by
+    exp(-R^T w): both blocks turn with R^T.
+    """
+    H = frame.information
+    assert H is not None
+    covariance = np.linalg.inv(H + 1e-6 * np.eye(6))
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = frame.R.T
+    out = turn @ covariance @ turn.T
+    return 0.5 * (out + out.T)

@@ -1,0 +1,232 @@
+"""The front end: where is the camera in this frame, given the last frame and the map around it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from services.slam.atlas import Atlas, Points, neighbours, points_of, shared_counts
+from services.slam.binary import match_all
+from services.slam.camera import CameraModel
+from services.slam.config import SlamConfig
+from services.slam.features import Features
+from services.slam.linear import log_so3, matmul3
+from services.slam.match import keep_common_turn, match_windows, project
+from services.slam.refine import refine_pose
+
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+Bool = NDArray[np.bool_]
+
+MATCH_LOOSE = 100
+"""Hamming distance allowed where the place is known well."""
+MATCH_BLIND = 60
+"""Where it is not."""
+_WINDOW_LAST_PX = 15.0
+_WINDOW_MAP_PX = 5.0
+_ENOUGH = 20
+"""Matches with the last frame below which the window is widened."""
+
+
+@dataclass(slots=True)
+class Tracked:
+    """A frame with its pose and the map points it sees."""
+
+    features: Features
+    R: F64
+    """Camera from map."""
+    t: F64
+    point: I32
+    """(N,) map point of each feature, -1 = none."""
+    inliers: int = 0
+    information: F64 | None = None
+    """(6, 6) of the pose, order (v, w), left perturbation of camera from map."""
+    chi2: float = 0.0
+
+
+class Tracking:
+    """Finds poses; reads the map, writes only the points' found and visible counters."""
+
+    def __init__(self, atlas: Atlas, camera: CameraModel, config: SlamConfig) -> None:
+        self.atlas = atlas
+        self.camera = camera
+        self.config = config
+
+    def follow(self, last: Tracked, features: Features, R: F64, t: F64) -> Tracked | None:
+        """Return the frame located from the last one, started at the predicted ``R``, ``t``; None when that fails."""
+        world, known, usable = self._points_of_last(last)
+        for widen in (1.0, 2.0, 4.0):
+            match = self._match_last(last, features, R, t, world, usable, widen * _WINDOW_LAST_PX)
+            if np.count_nonzero(match >= 0) < _ENOUGH * widen:
+                continue
+            found = self._locate(features, R, t, world, match, known)
+            if found is not None and found.inliers >= 0.5 * _ENOUGH:
+                return found
+        return self._follow_blind(last, features, world, known, usable)
+
+    def _points_of_last(self, last: Tracked) -> tuple[F64, I32, Bool]:
+        """Return places (N, 3) in the map of the last frame's features, their map points (-1: temporary), and which."""
+        known = np.where(last.point >= 0, last.point, -1)
+        known[(known >= 0) & (self.atlas.points.n[known] == 0)] = -1
+        f, cam = last.features, self.camera.array
+        z = f.depth
+        local = np.stack([(f.uv[:, 0] - cam[2]) * z / cam[0], (f.uv[:, 1] - cam[3]) * z / cam[1], z], axis=1)
+        world = (local - last.t) @ last.R
+        has = known >= 0
+        world[has] = self.atlas.points.pos[known[has]]
+        return world, known, has | (z > 0.0)
+
+    def _match_last(
+        self, last: Tracked, features: Features, R: F64, t: F64, world: F64, usable: Bool, window_px: float
+    ) -> I32:
+        cam, f = self.camera, last.features
+        place = predict(world, usable, R, t, cam.array, cam.width, cam.height)
+        radius = window_px * cam.scales[f.octave]
+        match = match_windows(
+            place, radius, f.octave - 1, f.octave + 1, f.desc, features.uv, features.disparity, features.octave,
+            features.desc, features.cell_start, features.cell_items, cam.cols, np.ones(len(features), np.bool_),
+            MATCH_LOOSE, 0.9,
+        )  # fmt: skip
+        keep_common_turn(match, f.angle, features.angle)
+        return match
+
+    def _locate(self, features: Features, R: F64, t: F64, world: F64, match: I32, known: I32) -> Tracked | None:
+        """Refine a pose over matches (query -> feature); the result holds the inliers that are map points."""
+        queries = np.flatnonzero(match >= 0)
+        index = match[queries]
+        R, t = R.copy(), t.copy()
+        count, use, H, chi2 = self.refine(features, R, t, world[queries], index)
+        if count < 6:
+            return None
+        point = np.full(len(features), -1, np.int32)
+        good = use & (known[queries] >= 0)
+        point[index[good]] = known[queries[good]]
+        return Tracked(features, R, t, point, count, H, chi2)
+
+    def refine(self, features: Features, R: F64, t: F64, world: F64, index: NDArray) -> tuple[int, Bool, F64, float]:
+        """Refine ``R``, ``t`` in place from ``world`` (M, 3) seen at features ``index``: inliers, which, information, chi2."""
+        cam = self.camera
+        disparity = features.disparity[index]
+        obs = np.column_stack([features.uv[index], disparity])
+        info = np.column_stack(
+            [1.0 / cam.variance[features.octave[index]], np.where(disparity > 0.0, cam.disparity_info, 0.0)]
+        )
+        use, H = np.ones(len(index), np.bool_), np.zeros((6, 6))
+        if len(index) < 6:
+            return 0, use, H, 0.0
+        count, chi2 = refine_pose(R, t, np.ascontiguousarray(world), obs, info, cam.array, use, H, 4)
+        return count, use, H, chi2
+
+    def _follow_blind(self, last: Tracked, features: Features, world: F64, known: I32, usable: Bool) -> Tracked | None:
+        """The wide search: descriptors alone, then RANSAC."""
+        queries = np.flatnonzero(usable)
+        if not len(queries) or not len(features):
+            return None
+        part = match_all(last.features.desc[queries], features.desc, MATCH_BLIND, 0.85)
+        match = np.full(len(world), -1, np.int32)
+        match[queries] = part
+        keep_common_turn(match, last.features.angle, features.angle)
+        return self.locate_by_ransac(features, world, match, known)
+
+    def locate_by_ransac(self, features: Features, world: F64, match: I32, known: I32) -> Tracked | None:
+        """Locate a frame without any prior from 3D-2D matches (query -> feature): AP3P in RANSAC, then refinement."""
+        import cv2
+
+        queries = np.flatnonzero(match >= 0)
+        if len(queries) < 10:
+            return None
+        c = self.camera.array
+        K = np.array([[c[0], 0.0, c[2]], [0.0, c[1], c[3]], [0.0, 0.0, 1.0]])
+        cv2.setRNGSeed(1)
+        ok, r, t, inliers = cv2.solvePnPRansac(
+            np.ascontiguousarray(world[queries]), np.ascontiguousarray(features.uv[match[queries]]), K, None,
+            iterationsCount=300, reprojectionError=4.0, confidence=0.9999, flags=cv2.SOLVEPNP_AP3P,
+        )  # fmt: skip
+        if not ok or inliers is None or len(inliers) < 10:
+            return None
+        R, _ = cv2.Rodrigues(r)
+        kept = np.full_like(match, -1)
+        kept[queries[inliers[:, 0]]] = match[queries[inliers[:, 0]]]
+        return self._locate(features, np.ascontiguousarray(R), np.ascontiguousarray(t[:, 0]), world, kept, known)
+
+    def join_map(self, frame: Tracked, window_px: float = _WINDOW_MAP_PX) -> tuple[Tracked, int] | None:
+        """Match the frame with the local map and refine; returns it and its best keyframe slot, None when that fails."""
+        atlas, cam = self.atlas, self.camera
+        counts = shared_counts(atlas.points, frame.point, len(atlas.keyframes.n))
+        if not counts.any():
+            return None
+        slots = self._local_keyframes(counts)
+        ids = points_of(atlas.points, atlas.keyframes, slots)
+        taken = np.zeros(len(atlas.points.n), np.bool_)
+        taken[frame.point[frame.point >= 0]] = True
+        ids = ids[~taken[ids]]
+        m = len(ids)
+        place, octave, cosine = np.empty((m, 3)), np.zeros(m, np.int32), np.empty(m)
+        p = atlas.points
+        project(ids, p.pos, p.normal, p.near, p.far, frame.R, frame.t, cam.array, cam.width, cam.height,
+                self.config.scale, self.config.levels, place, octave, cosine)  # fmt: skip
+        f = frame.features
+        match = match_windows(
+            place, window_px * cam.scales[octave], octave - 1, octave + 1, p.desc[ids], f.uv, f.disparity, f.octave, f.desc,
+            f.cell_start, f.cell_items, cam.cols, frame.point < 0, MATCH_LOOSE, 0.8,
+        )  # fmt: skip
+        point = frame.point.copy()
+        got = match >= 0
+        point[match[got]] = ids[got]
+        index = np.flatnonzero(point >= 0)
+        R, t = frame.R.copy(), frame.t.copy()
+        count, use, H, chi2 = self.refine(f, R, t, p.pos[point[index]], index)
+        seen = np.concatenate([ids[~np.isnan(place[:, 0])], frame.point[frame.point >= 0]])
+        np.add.at(p.visible, seen, 1)
+        if count < 6:
+            return None
+        np.add.at(p.found, point[index[use]], 1)
+        point[index[~use]] = -1
+        located = Tracked(f, R, t, point, count, H, chi2)
+        counts = shared_counts(atlas.points, point, len(atlas.keyframes.n))
+        best = np.lexsort((-atlas.keyframes.serial, -counts))[0]
+        return located, int(best)
+
+    def _local_keyframes(self, counts: I32) -> I32:
+        atlas = self.atlas
+        order = np.lexsort((-atlas.keyframes.serial, -counts))
+        first = order[counts[order] > 0][:30]
+        chosen = list(first)
+        for k in first[:4]:
+            chosen.extend(neighbours(atlas, int(k), 30, 5))
+        return np.array(list(dict.fromkeys(int(k) for k in chosen)), np.int32)
+
+
+@njit(cache=True, nogil=True)
+def predict(world: F64, usable: Bool, R: F64, t: F64, camera: F64, width: float, height: float) -> F64:
+    """Return (M, 3) u, v, disparity of points seen from ``R``, ``t``; u is NaN where unusable or out of sight."""
+    out = np.full((len(world), 3), np.nan)
+    for i in range(len(world)):
+        if not usable[i]:
+            continue
+        X = world[i]
+        z = R[2, 0] * X[0] + R[2, 1] * X[1] + R[2, 2] * X[2] + t[2]
+        if z < 0.05:
+            continue
+        u = camera[0] * (R[0, 0] * X[0] + R[0, 1] * X[1] + R[0, 2] * X[2] + t[0]) / z + camera[2]
+        v = camera[1] * (R[1, 0] * X[0] + R[1, 1] * X[1] + R[1, 2] * X[2] + t[1]) / z + camera[3]
+        if 0.0 <= u < width and 0.0 <= v < height:
+            out[i, 0], out[i, 1], out[i, 2] = u, v, camera[4] / z
+    return out
+
+
+def still_points(points: Points, point: I32) -> I32:
+    """Return ``point`` with those that left the map replaced by -1."""
+    out = point.copy()
+    has = out >= 0
+    out[has] = np.where(points.n[out[has]] > 0, out[has], -1)
+    return out
+
+
+def moved(R_a: F64, t_a: F64, R_b: F64, t_b: F64) -> tuple[float, float]:
+    """Return the distance (m) and angle (rad) between two camera-from-map poses."""
+    distance = float(np.linalg.norm(R_a.T @ t_a - R_b.T @ t_b))
+    return distance, float(np.linalg.norm(log_so3(matmul3(R_a, np.ascontiguousarray(R_b.T)))))
