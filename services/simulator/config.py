@@ -1,0 +1,71 @@
+"""Configuration of the simulator."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class SensorConfig(BaseModel):
+    """The camera's faults: an active stereo camera outdoors, and a cheap accelerometer."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    disparity_sigma_px: float = Field(default=0.08, ge=0.0, le=1.0)
+    """Matching noise s; 0 gives perfect depth within the range, without edges or holes."""
+    fixed_share: float = Field(default=0.4, ge=0.0, le=1.0)
+    """Share of the noise's variance that is the same in every frame."""
+    focal_px: float = Field(default=565.0, gt=0.0)
+    baseline_m: float = Field(default=0.070, gt=0.0)
+    min_range_m: float = Field(default=0.5, ge=0.0)
+    fade_range_m: float = Field(default=6.0, gt=0.0)
+    """Beyond this depth thins out, until ``max_range_m``, where there is none."""
+    max_range_m: float = Field(default=8.0, gt=0.0, le=65.0)
+    dropout: float = Field(default=0.01, ge=0.0, le=0.4)
+    """About the share of pixels without data on a plain surface."""
+    colour_sigma: float = Field(default=2.0, ge=0.0)
+    exposure_swing: float = Field(default=0.04, ge=0.0, le=0.5)
+    accel_sigma_m_s2: float = Field(default=0.08, ge=0.0)
+    accel_bias_m_s2: float = Field(default=0.08, ge=0.0)
+
+
+class PathConfig(BaseModel):
+    """The scripted path: rise, turn, face the nearest suitable tree, approach."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    start_height_m: float = Field(default=0.1, gt=0.0)
+    height_m: float = Field(default=1.5, gt=0.0)
+    turn_rate_rad_s: float = Field(default=0.5236, gt=0.0, le=2.0)
+    speed_m_s: float = Field(default=0.5, gt=0.0)
+    dock_distance_m: float = Field(default=0.95, gt=0.3)
+    rest_s: float = Field(default=1.0, ge=0.0)
+    hold_s: float = Field(default=1.5, ge=0.0)
+    """At the end, docked."""
+    sway_m: float = Field(default=0.02, ge=0.0)
+    tilt_rad: float = Field(default=0.017, ge=0.0)
+    """Amplitude of roll and pitch."""
+
+
+class SimulatorConfig(BaseModel):
+    """The simulator service."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    scene: str = "random-mission"
+    """A name of the catalogue (multi-03), or random-KIND: then ``seed`` draws the scene."""
+    seed: int = Field(default=1, ge=0)
+    trees: int | None = Field(default=None, ge=0, le=12)
+    """Suitable trees asked for in a random scene."""
+    rate_hz: float = Field(default=15.0, gt=0.0, le=60.0)
+    clock_rate_hz: float = Field(default=100.0, gt=0.0, le=1000.0)
+    reduced: bool = False
+    """Render 320x240 and scale up: for slow machines."""
+    mode: Literal["scan"] = "scan"
+    answer_timeout_s: float = Field(default=10.0, gt=0.0)
+    """Wall time that slam and refiner have for a frame before simulated time goes on without them."""
+    body_radius_m: float = Field(default=0.25, gt=0.0)
+    """The aircraft as a ball round the camera, for touches."""
+    sensor: SensorConfig = SensorConfig()
+    path: PathConfig = PathConfig()
