@@ -1,0 +1,312 @@
+"""What the mission knows at one step: inputs, and the estimates it keeps from step to step. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Generic, Literal, TypeVar
+
+import numpy as np
+
+from schemas.navigation import Guidance, GuidanceCommand, MissionState, MissionStateName
+from schemas.slam import Pose
+from schemas.trees import Target, Tree, TreeList
+from schemas.vehicle import VehicleState
+from services.common.geometry import Matrix, wrap_angle
+from services.navigator.config import NavigatorConfig
+from services.navigator.docking import DockMonitor, DockSample
+from services.navigator.path import Disc
+from services.navigator.selection import axis_at
+from services.navigator.track import Correction, PoseTrack, Sample, Step, TrackLimits
+from services.navigator.trajectory import Aim, Trajectory
+
+T = TypeVar("T")
+
+_AXIS_TIME_CONSTANT_S = 0.4
+_AXIS_GATE_M = 0.6
+_SCAN_BINS = 36
+
+
+@dataclass(frozen=True, slots=True)
+class Seen(Generic[T]):
+    """A message and when it came, on the aircraft's own clock."""
+
+    message: T
+    received_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """The latest of everything, at ``now_ns``; ``services`` maps a service to its last health's arrival."""
+
+    now_ns: int
+    pose: Seen[Pose] | None = None
+    trees: Seen[TreeList] | None = None
+    target: Seen[Target] | None = None
+    vehicle: Seen[VehicleState] | None = None
+    services: Mapping[str, int] = field(default_factory=dict)
+
+    def age_s(self, seen: Seen[T] | None) -> float:
+        """Return the seconds since a message came, inf when none did."""
+        return float("inf") if seen is None else (self.now_ns - seen.received_ns) / 1e9
+
+    def service_age_s(self, name: str) -> float:
+        """Return the seconds since a service's last health, inf when it never spoke."""
+        at = self.services.get(name)
+        return float("inf") if at is None else (self.now_ns - at) / 1e9
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """One transition and its reason."""
+
+    stamp_ns: int
+    before: MissionStateName
+    after: MissionStateName
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Outputs:
+    """What one step gives."""
+
+    guidance: Guidance
+    state: MissionState
+    events: tuple[Event, ...]
+
+
+Motion = Literal["aim", "brake", "freeze", "follow"]
+"""How the setpoint moves: to the aim; to rest; stop at once; stand where the aircraft is."""
+
+
+@dataclass(frozen=True, slots=True)
+class Intent:
+    """What a state wants done now."""
+
+    command: GuidanceCommand
+    motion: Motion = "brake"
+    aim: Aim | None = None
+    magnitude: float = 0.0
+    unit: Literal["m", "rad", ""] = ""
+    engage: bool = True
+    land: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Next:
+    """The state to go to, and why."""
+
+    state: MissionStateName
+    reason: str
+
+
+@dataclass
+class Board:
+    """The mission's memory. Everything in map coordinates follows a correction of the map."""
+
+    config: NavigatorConfig
+    track: PoseTrack = field(init=False)
+    trajectory: Trajectory = field(init=False)
+    dock: DockMonitor = field(init=False)
+    inputs: Inputs = field(default_factory=lambda: Inputs(0))
+    step_kind: Step = Step.STALE
+    """Of the pose taken at this step."""
+    correction: Correction | None = None
+    home_m: Matrix | None = None
+    home_yaw_rad: float = 0.0
+    target_id: int | None = None
+    axis_m: Matrix | None = None
+    """Filtered trunk axis x, y (2,) of the target."""
+    ground_z_m: float = 0.0
+    """Of the target's foot."""
+    visited_ids: list[int] = field(default_factory=list)
+    given_up_ids: list[int] = field(default_factory=list)
+    done_xy_m: list[Matrix] = field(default_factory=list)
+    wanted_id: int | None = None
+    docked_count: int = 0
+    trees_wanted: int = 1
+    scan_left_rad: float = 0.0
+    scan_seen: set[int] = field(default_factory=set)
+    scan_turned_rad: float = 0.0
+    dock_direction: Matrix | None = None
+    """Unit vector (2,) from the axis to the docking place."""
+    dock_offset_m: float = 0.0
+    dock_yaw_rad: float = 0.0
+    corners: list[Matrix] = field(default_factory=list)
+    planned_ns: int = -1
+    dt_s: float = 0.0
+    _target_stamp_ns: int = -1
+    _off_gate: bool = False
+    """The depth image shows a trunk where the map has none: not our target, whatever its id."""
+
+    def __post_init__(self) -> None:
+        f = self.config.failsafe
+        self.track = PoseTrack(TrackLimits(jump_m=f.pose_jump_m, jump_rad=f.pose_jump_rad))
+        self.trajectory = Trajectory(self.config.motion)
+        self.dock = DockMonitor(self.config.dock)
+
+    # -- what is known ------------------------------------------------------------------------------------------
+    @property
+    def now_ns(self) -> int:
+        """The step's time."""
+        return self.inputs.now_ns
+
+    @property
+    def here(self) -> Sample | None:
+        """The last tracked pose while slam is trusted, else None."""
+        fresh = self.inputs.age_s(self.inputs.pose) <= self.config.failsafe.pose_silent_s
+        return self.track.latest if fresh and not self.track.lost else None
+
+    @property
+    def vehicle(self) -> VehicleState | None:
+        """The vehicle while its word is fresh."""
+        seen = self.inputs.vehicle
+        if seen is None or self.inputs.age_s(seen) > self.config.failsafe.vehicle_silent_s:
+            return None
+        return seen.message if seen.message.connected else None
+
+    @property
+    def trees(self) -> tuple[Tree, ...]:
+        """The listed trees of the present map."""
+        seen, last = self.inputs.trees, self.track.latest
+        if seen is None or last is None or seen.message.map_id != last.map_id:
+            return ()
+        return seen.message.trees
+
+    @property
+    def target(self) -> Target | None:
+        """The chosen tree in the depth image while it is tracked and fresh, else None."""
+        seen, last = self.inputs.target, self.track.latest
+        if seen is None or last is None or self.inputs.age_s(seen) > self.config.failsafe.target_lost_s:
+            return None
+        t = seen.message
+        wrong = t.status != "tracking" or t.tree_id != self.target_id or t.map_id != last.map_id
+        return None if wrong or self._off_gate or t.range_m is None or t.bearing_rad is None else t
+
+    @property
+    def flight_z_m(self) -> float:
+        """Height of the camera in map for level flight; higher when the target stands uphill."""
+        home_z = 0.0 if self.home_m is None else float(self.home_m[2])
+        level = home_z + self.config.flight_height_m - self.config.start_height_m
+        if self.axis_m is None:
+            return level
+        return min(max(level, self.ground_z_m + self.config.min_ground_m), home_z + self.config.motion.fence_height_m)
+
+    def discs(self, keep_out_m: float) -> list[Disc]:
+        """Return the listed trunks but the target, grown by ``keep_out_m``."""
+        z = self.flight_z_m
+        places = [(axis_at(t, z), t) for t in self.trees if t.id != self.target_id]
+        return [Disc(float(p[0]), float(p[1]), t.radius_m + keep_out_m) for p, t in places]
+
+    def to_axis(self) -> tuple[float, float] | None:
+        """Return believed distance (m) to the target's axis and its bearing (rad, positive left), or None."""
+        t, here = self.target, self.here
+        if t is not None and t.measured and t.range_m is not None and t.bearing_rad is not None:
+            return t.range_m, t.bearing_rad
+        if here is None or self.axis_m is None:
+            return None
+        offset = self.axis_m - here.position_m[:2]
+        return float(np.linalg.norm(offset)), wrap_angle(float(np.arctan2(offset[1], offset[0])) - here.yaw_rad)
+
+    # -- keeping it current -------------------------------------------------------------------------------------
+    def observe(self, inputs: Inputs) -> None:
+        """Take a step's inputs."""
+        if self.inputs.now_ns:
+            self.dt_s = min(max((inputs.now_ns - self.inputs.now_ns) / 1e9, 0.0), 0.2)
+        self.inputs, self.correction, self.step_kind = inputs, None, Step.STALE
+        before = None if self.track.latest is None else self.track.latest.map_id
+        if inputs.pose is not None:
+            self.step_kind = self.track.add(inputs.pose.message, inputs.pose.received_ns)
+            self.correction = self.track.correction
+        if self.correction is not None:
+            self._correct(self.correction)
+        after = None if self.track.latest is None else self.track.latest.map_id
+        if before is not None and after != before:
+            self._drop_map()
+        if self.here is not None and self.step_kind not in (Step.STALE, Step.LOST):
+            self._count_scan(self.here)
+        self._follow_target()
+
+    def choose(self, tree: Tree) -> None:
+        """Make a listed tree the target."""
+        self.target_id, self.wanted_id = tree.id, None
+        self.ground_z_m = tree.z_m
+        self.axis_m = None
+        self.axis_m = axis_at(tree, self.flight_z_m)
+        self.dock.clear()
+        self.dock_direction, self.corners, self.planned_ns = None, [], -1
+        self.dock_offset_m = self.dock_yaw_rad = 0.0
+
+    def finish_target(self, *, visited: bool) -> None:
+        """Put the target among the visited or the given-up trees."""
+        if self.target_id is None:
+            return
+        (self.visited_ids if visited else self.given_up_ids).append(self.target_id)
+        if self.axis_m is not None:
+            self.done_xy_m.append(self.axis_m.copy())
+        self.docked_count += int(visited)
+
+    def drop_target(self) -> None:
+        """Have no target any more."""
+        self.target_id, self.axis_m, self.dock_direction = None, None, None
+        self.dock.clear()
+
+    def _correct(self, c: Correction) -> None:
+        def flat(p: Matrix) -> Matrix:
+            return c.point(np.array([p[0], p[1], 0.0]))[:2]
+
+        self.trajectory.correct(c)
+        if self.home_m is not None:
+            self.home_m = c.point(self.home_m)
+        if self.axis_m is not None:
+            self.axis_m = flat(self.axis_m)
+        if self.dock_direction is not None:
+            self.dock_direction = c.vector(np.array([*self.dock_direction, 0.0]))[:2]
+        self.ground_z_m += float(c.shift_m[2])
+        self.done_xy_m = [flat(p) for p in self.done_xy_m]
+        self.corners, self.planned_ns = [], -1
+        self.dock.clear()
+
+    def _drop_map(self) -> None:
+        """Another map: nothing known by coordinates or id is valid in it."""
+        self.drop_target()
+        self.visited_ids, self.given_up_ids = [], []
+        self.wanted_id = None
+        self.scan_seen.clear()
+        if self.correction is None:
+            self.done_xy_m = []
+            if self.home_m is not None and self.track.latest is not None:
+                self.home_m = self.track.latest.position_m.copy()
+
+    def _count_scan(self, here: Sample) -> None:
+        self.scan_seen.add(int((here.yaw_rad + np.pi) / (2.0 * np.pi) * _SCAN_BINS) % _SCAN_BINS)
+
+    @property
+    def scan_gaps(self) -> int:
+        """How many of the 10-degree headings no tracked frame has looked along."""
+        return _SCAN_BINS - len(self.scan_seen)
+
+    def _follow_target(self) -> None:
+        self._off_gate = False
+        t, here = self.target, self.here
+        if t is None or here is None or not t.measured:
+            return
+        if t.range_m is None or t.bearing_rad is None:
+            return
+        seen = self._axis_seen(t, here)
+        self._off_gate = self.axis_m is None or float(np.linalg.norm(seen - self.axis_m)) > _AXIS_GATE_M
+        if self._off_gate or self.axis_m is None or t.stamp_ns <= self._target_stamp_ns:
+            return
+        dt = min((t.stamp_ns - self._target_stamp_ns) / 1e9, 1.0)
+        self._target_stamp_ns = t.stamp_ns
+        self.axis_m = self.axis_m + dt / (dt + _AXIS_TIME_CONSTANT_S) * (seen - self.axis_m)
+        self.dock.add(DockSample(t.stamp_ns, t.range_m, t.bearing_rad, here.position_m.copy()))
+
+    @staticmethod
+    def _axis_seen(t: Target, here: Sample) -> Matrix:
+        if t.position_map_m is not None:
+            return np.array(t.position_map_m)
+        assert t.range_m is not None
+        assert t.bearing_rad is not None
+        heading = here.yaw_rad + t.bearing_rad
+        return here.position_m[:2] + t.range_m * np.array([np.cos(heading), np.sin(heading)])

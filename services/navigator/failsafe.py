@@ -1,0 +1,231 @@
+"""The failsafes: each row of docs/safety.md as a detector. Pure.
+
+A detector looks at the board and says what is wrong, or nothing. The mission answers: release, hold (and land when
+the hold's limit has passed), or land.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from schemas.navigation import MissionStateName
+from services.navigator.board import Board
+from services.navigator.path import clearance_m
+from services.navigator.track import Step
+
+Response = Literal["release", "hold", "land"]
+
+AIRBORNE: frozenset[MissionStateName] = frozenset(
+    {"take_off", "scan", "select", "face", "approach", "dock", "docked", "undock", "return", "hold"}
+)
+"""States in which the aircraft may fly under our setpoints."""
+_VISUAL: frozenset[MissionStateName] = frozenset({"approach", "dock"})
+_NEEDS_LIST: frozenset[MissionStateName] = frozenset({"scan", "select", "face"})
+_BODY_MARGIN_M = 0.10
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """A failsafe in force: its name in docs/safety.md, what to do, the operator's word, seconds in hold."""
+
+    name: str
+    response: Response
+    word: str
+    hold_s: float = 0.0
+    blind: bool = False
+    """Nobody knows where the aircraft is: stop at once instead of braking along a path."""
+
+
+@dataclass
+class Watch:
+    """Runs the detectors in order of precedence; keeps what they need to remember."""
+
+    mission_id: int = 0
+    engaged: bool = False
+    """The bridge has said that it is engaged for this mission."""
+    armed: bool = False
+    """The vehicle was armed in offboard for this mission."""
+    ground_seen: bool = False
+    _jumped_ns: int | None = None
+    _jump_word: str = ""
+    _map_id: str | None = field(default=None)
+
+    def begin(self, mission_id: int) -> None:
+        """Forget the last mission."""
+        self.mission_id, self.engaged, self.armed = mission_id, False, False
+        self.ground_seen, self._jumped_ns, self._map_id = False, None, None
+
+    def check(self, board: Board, state: MissionStateName, resume: MissionStateName) -> Fault | None:
+        """Return the most pressing fault, or None. ``resume`` is the state a hold interrupts."""
+        self._remember(board)
+        if state not in AIRBORNE and state != "landing":
+            return None
+        doing = resume if state == "hold" else state
+        for detector in _DETECTORS:
+            fault = detector(self, board, doing)
+            if fault is not None and (state != "landing" or fault.response == "release"):
+                return fault
+        return None
+
+    def _remember(self, b: Board) -> None:
+        v = b.vehicle
+        if v is not None and v.engaged_mission_id == self.mission_id:
+            self.engaged = True
+            self.armed |= v.armed and v.mode == "offboard"
+        self.ground_seen |= "station" in b.inputs.services
+        self._remember_jump(b)
+
+    def _remember_jump(self, b: Board) -> None:
+        f = b.config.failsafe
+        if b.step_kind is Step.JUMP:
+            self._jumped_ns, self._jump_word = b.now_ns, "the pose jumped"
+        elif b.step_kind is Step.RELOCATED:
+            self._jumped_ns, self._jump_word = b.now_ns, "slam found itself again at another place"
+        elif b.correction is not None and b.track.latest is not None:
+            moved = float(np.linalg.norm(b.track.latest.position_m - b.correction.back(b.track.latest.position_m)))
+            if moved > f.correction_hold_m or abs(b.correction.yaw_rad) > f.pose_jump_rad:
+                self._jumped_ns, self._jump_word = b.now_ns, f"slam corrected the map by {moved:.2f} m"
+        if b.track.latest is not None and not b.track.lost:
+            if self._map_id is not None and b.track.latest.map_id != self._map_id:
+                self._jumped_ns, self._jump_word = b.now_ns, "slam began a new map"
+            self._map_id = b.track.latest.map_id
+
+
+def _operator(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
+    v = b.vehicle
+    if v is None:
+        return None
+    if v.operator_override:
+        return Fault("operator", "release", f"operator took over: mode {v.mode}; we are silent")
+    if not w.armed or doing == "landing":
+        return None
+    if not v.armed:
+        return Fault("operator", "release", "disarmed, not by us; we are silent")
+    if v.mode != "offboard":
+        return Fault("operator", "release", f"mode {v.mode}, not by us; we are silent")
+    return None
+
+
+def _bridge_restarted(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
+    del doing
+    v = b.vehicle
+    if v is None or not w.engaged or v.engaged_mission_id == w.mission_id:
+        return None
+    return Fault("autopilot restarted", "land", "the autopilot bridge was restarted; the aircraft lands by itself")
+
+
+def _vehicle_link(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
+    del w, doing
+    if b.config.handheld or b.vehicle is not None:
+        return None
+    f = b.config.failsafe
+    return Fault("autopilot link lost", "hold", "no word from the autopilot", f.vehicle_hold_s)
+
+
+def _slam(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
+    f = b.config.failsafe
+    del w, doing
+    age = b.inputs.age_s(b.inputs.pose)
+    if age > f.pose_silent_s:
+        name, word = _who_is_silent(b)
+        return Fault(name, "hold", f"{word}: no pose for {age:.1f} s", f.pose_hold_s, blind=True)
+    if b.track.lost:
+        return Fault("slam lost", "hold", "slam lost its place", f.pose_hold_s, blind=True)
+    return None
+
+
+def _who_is_silent(b: Board) -> tuple[str, str]:
+    limit = b.config.failsafe.service_silent_s
+    for service in ("slam", "camera"):
+        if service in b.inputs.services and b.inputs.service_age_s(service) > limit:
+            return ("service dead" if service == "slam" else "camera silent"), f"{service} is dead or hung"
+    return "camera silent", "camera or slam silent"
+
+
+def _pose_jump(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
+    del doing
+    if w._jumped_ns is None or (b.now_ns - w._jumped_ns) / 1e9 > b.config.failsafe.clear_s:  # noqa: SLF001
+        return None
+    return Fault("pose jump", "hold", w._jump_word, b.config.failsafe.pose_hold_s, blind=True)  # noqa: SLF001
+
+
+def _battery(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
+    del w, doing
+    v = b.vehicle
+    if v is None or v.battery_share is None or v.battery_share > b.config.failsafe.battery_land_share:
+        return None
+    return Fault("battery low", "land", f"battery at {100.0 * v.battery_share:.0f} %: landing")
+
+
+def _geofence(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
+    del w, doing
+    fence, here = b.trajectory.fence, b.here
+    if fence is None or here is None:
+        return None
+    excess = fence.excess_m(here.position_m)
+    if excess <= b.config.motion.fence_margin_m:
+        return None
+    return Fault("geofence", "land", f"{excess:.1f} m outside the geofence: landing")
+
+
+def _services(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
+    del w
+    f = b.config.failsafe
+    needed = ["slam"]
+    if doing in _VISUAL:
+        needed.append("refiner")
+    if doing in _NEEDS_LIST:
+        needed += ["mapper", "detector"]
+    for name in needed:
+        if name in b.inputs.services and b.inputs.service_age_s(name) > f.service_silent_s:
+            return Fault("service dead", "hold", f"{name} is dead or hung", f.service_hold_s, blind=name == "slam")
+    return None
+
+
+def _target(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
+    del w
+    if doing not in _VISUAL or b.target is not None:
+        return None
+    seen = b.to_axis()
+    if doing == "approach" and seen is not None and seen[0] > b.config.visual_range_m:
+        return None
+    return Fault("target lost", "hold", "the target is out of sight", b.config.failsafe.target_hold_s)
+
+
+def _trees(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
+    del w
+    f = b.config.failsafe
+    if doing not in ("select", "face") or b.inputs.trees is None or b.inputs.age_s(b.inputs.trees) <= f.trees_stale_s:
+        return None
+    return Fault("trees stale", "hold", "the list of trees is old", f.trees_hold_s)
+
+
+def _obstacle(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
+    del w, doing
+    here = b.here
+    if here is None or float(np.linalg.norm(b.trajectory.velocity_m_s)) < 0.05:
+        return None
+    discs = b.discs(b.config.aircraft_radius_m + _BODY_MARGIN_M)
+    ahead = here.position_m[:2] + b.trajectory.velocity_m_s[:2]
+    now, then = clearance_m(here.position_m[:2], discs), clearance_m(ahead, discs)
+    if then >= 0.0 or then >= now:
+        return None
+    return Fault("obstacle", "hold", "a trunk stands in the way", b.config.failsafe.obstacle_hold_s)
+
+
+def _ground_link(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
+    del doing
+    f = b.config.failsafe
+    if not w.ground_seen or b.inputs.service_age_s("station") <= f.ground_silent_s:
+        return None
+    return Fault("ground link lost", "hold", "the ground station is out of reach", f.ground_hold_s)
+
+
+_DETECTORS: tuple[Callable[[Watch, Board, MissionStateName], Fault | None], ...] = (
+    _operator, _bridge_restarted, _vehicle_link, _battery, _geofence, _slam, _pose_jump, _services, _target, _trees,
+    _obstacle, _ground_link,
+)  # fmt: skip

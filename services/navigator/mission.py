@@ -1,0 +1,333 @@
+"""The mission: an explicit state machine from the ground to the tree and back. Pure: no bus, no clock, no files.
+
+``order`` takes the operator's commands, ``step`` everything else. A step first looks at the board, then at the
+failsafes, then lets the present state speak. Whatever is wanted, the setpoint moves by ``Trajectory`` alone, so no
+state can exceed the limits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from schemas.command import CommandName
+from schemas.navigation import Guidance, MissionState, MissionStateName, Setpoint
+from services.common.geometry import Matrix, wrap_angle
+from services.navigator.board import Board, Event, Inputs, Intent, Next, Outputs
+from services.navigator.config import NavigatorConfig
+from services.navigator.failsafe import AIRBORNE, Fault, Watch
+from services.navigator.preflight import missing
+from services.navigator.states import STATES
+from services.navigator.trajectory import Fence
+from services.navigator.track import Step
+
+_RESUME: dict[MissionStateName, MissionStateName] = {"approach": "face", "dock": "approach"}
+"""Where a hold resumes when not in the state it interrupted: the target is looked for again."""
+_GROUNDED: frozenset[MissionStateName] = frozenset({"idle", "landed", "failed", "released"})
+_FLOOR_M = 0.3
+"""The geofence's floor lies this far below the start: ground may fall away."""
+
+HoldCause = Literal["operator", "fault", "restart"]
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The answer to an order."""
+
+    accepted: bool
+    reason: str
+
+
+class Mission:
+    """The state machine. Deterministic: the same orders and inputs give the same outputs."""
+
+    def __init__(self, config: NavigatorConfig) -> None:
+        self.config = config
+        self.state: MissionStateName = "idle"
+        self.previous: MissionStateName = "idle"
+        self.reason = "waiting for a start command"
+        self.since_ns = 0
+        self.mission_id = 0
+        self.board = Board(config)
+        self.watch = Watch()
+        self.fault: Fault | None = None
+        self._hold_cause: HoldCause = "fault"
+        self._hold_limit_s = 0.0
+        self._resume: MissionStateName = "idle"
+        self._clear_since_ns: int | None = None
+        self._events: list[Event] = []
+        self._seq = 0
+
+    # -- orders -------------------------------------------------------------------------------------------------
+    def order(self, name: CommandName, tree_id: int | None, now_ns: int) -> Verdict:
+        """Carry out an operator's command, or say why not."""
+        if name == "start":
+            return self._start(now_ns)
+        if self.state not in AIRBORNE | {"preflight"}:
+            return Verdict(False, f"nothing to {name}: the mission is {self.state}")
+        if name in ("abort", "land"):
+            return self._come_down(name, now_ns)
+        if name == "hold":
+            if self.state == "preflight":
+                return Verdict(False, "still on the ground: abort instead")
+            self._hold(
+                Fault("", "hold", "the operator said hold", self.config.failsafe.operator_hold_s), "operator", now_ns
+            )
+            return Verdict(True, "holding")
+        if name == "resume":
+            return self._order_resume(now_ns)
+        if name == "choose":
+            return self._order_choose(tree_id, now_ns)
+        return self._order_next(now_ns)
+
+    def _start(self, now_ns: int) -> Verdict:
+        v = self.board.vehicle
+        if self.state not in _GROUNDED:
+            return Verdict(False, f"a mission is under way: {self.state}")
+        if not self.config.handheld:
+            if v is None:
+                return Verdict(False, "no word from the autopilot: is the bridge running and the vehicle connected?")
+            if v.armed:
+                return Verdict(False, "the vehicle is armed: a mission starts from the ground, disarmed")
+        engaged = v.engaged_mission_id if v is not None else 0
+        self.mission_id = max(self.mission_id, engaged) + 1
+        board, self.board = self.board, Board(self.config)
+        self.board.inputs, self.board.track = board.inputs, board.track
+        self.board.trees_wanted = self.config.trees_wanted
+        self.watch.begin(self.mission_id)
+        self._hold_cause = "fault"
+        self._go(Next("preflight", f"mission {self.mission_id} ordered"), now_ns)
+        return Verdict(True, self.reason)
+
+    def _come_down(self, name: str, now_ns: int) -> Verdict:
+        if self.state == "preflight" or (self.state == "take_off" and not self.watch.armed):
+            self._go(Next("landed", f"{name} ordered before take-off"), now_ns)
+        else:
+            self._go(Next("landing", f"{name} ordered"), now_ns)
+        return Verdict(True, self.reason)
+
+    def _order_resume(self, now_ns: int) -> Verdict:
+        if self.state != "hold":
+            return Verdict(False, f"nothing to resume: the mission is {self.state}")
+        if self.fault is not None:
+            return Verdict(False, f"cannot resume yet: {self.fault.word}")
+        self._leave_hold("the operator said resume", now_ns)
+        return Verdict(True, self.reason)
+
+    def _order_choose(self, tree_id: int | None, now_ns: int) -> Verdict:
+        tree = next((t for t in self.board.trees if t.id == tree_id), None)
+        if tree is None:
+            known = ", ".join(str(t.id) for t in self.board.trees) or "none"
+            return Verdict(False, f"no tree {tree_id} in the list (known: {known})")
+        if not tree.suitable:
+            return Verdict(False, f"tree {tree_id} is not suitable")
+        if tree.id in self.board.visited_ids:
+            self.board.trees_wanted += 1
+        self.board.wanted_id = tree.id
+        if self.state in ("face", "approach"):
+            self.board.drop_target()
+            self._go(Next("select", f"the operator chose tree {tree_id}"), now_ns)
+        elif self.state in ("dock", "docked"):
+            self.board.trees_wanted = max(self.board.trees_wanted, self.board.docked_count + 1)
+            self._go(Next("undock", f"the operator chose tree {tree_id}"), now_ns)
+        return Verdict(True, f"tree {tree_id} is next")
+
+    def _order_next(self, now_ns: int) -> Verdict:
+        if self.state not in ("face", "approach", "dock", "docked"):
+            return Verdict(False, f"no target to leave: the mission is {self.state}")
+        if self.state != "docked":
+            self.board.finish_target(visited=False)
+        self.board.trees_wanted = max(self.board.trees_wanted, self.board.docked_count + 1)
+        if self.state in ("dock", "docked"):
+            self._go(Next("undock", "the operator said next"), now_ns)
+        else:
+            self.board.drop_target()
+            self._go(Next("select", "the operator said next"), now_ns)
+        return Verdict(True, "the next tree")
+
+    # -- the step -----------------------------------------------------------------------------------------------
+    def step(self, inputs: Inputs) -> Outputs:
+        """Advance to ``inputs.now_ns`` and say what to do."""
+        if self.state == "idle" and self.since_ns == 0:
+            self.since_ns = inputs.now_ns
+        self.board.observe(inputs)
+        if self.board.step_kind in (Step.FIRST, Step.RELOCATED, Step.JUMP) and self.board.here is not None:
+            self.board.trajectory.reset(self.board.here.position_m, self.board.here.yaw_rad)
+        self._adopt(inputs.now_ns)
+        self.fault = self.watch.check(self.board, self.state, self._resume)
+        self._answer(inputs.now_ns)
+        intent = self._intent(inputs.now_ns)
+        self._move(intent)
+        events, self._events = tuple(self._events), []
+        self._seq += 1
+        return Outputs(self._guidance(intent, inputs.now_ns), self._report(inputs.now_ns), events)
+
+    def _adopt(self, now_ns: int) -> None:
+        """A navigator started while the aircraft flies under our setpoints holds, and then lands."""
+        v = self.board.vehicle
+        if self.state != "idle" or self.mission_id or v is None or self.config.handheld:
+            return
+        if v.engaged_mission_id and v.armed and v.mode == "offboard" and not v.operator_override:
+            self.mission_id = v.engaged_mission_id
+            self.watch.begin(self.mission_id)
+            self.board.trees_wanted = self.config.trees_wanted
+            self._resume, self._hold_cause = "select", "restart"
+            self._prepare_flight()
+            word = "the navigator was restarted in flight: holding, then landing"
+            self._hold(Fault("", "hold", word, self.config.failsafe.restart_hold_s), "restart", now_ns)
+
+    def _answer(self, now_ns: int) -> None:
+        """Do what the fault in force asks for."""
+        fault = self.fault
+        if fault is None:
+            if self.state == "hold":
+                self._wait_in_hold(now_ns)
+            return
+        self._clear_since_ns = None
+        if fault.response == "release":
+            self._go(Next("released", fault.word), now_ns)
+        elif self.state == "take_off" and not self.watch.armed and not self.config.handheld:
+            self._go(Next("failed", f"before take-off: {fault.word}"), now_ns)
+        elif fault.response == "land":
+            self._go(Next("landing", fault.word), now_ns)
+        elif self.state != "hold":
+            self._hold(fault, "fault", now_ns)
+        elif self._held_s(now_ns) > min(self._hold_limit_s, fault.hold_s):
+            self._give_up_hold(fault.word, now_ns)
+
+    def _wait_in_hold(self, now_ns: int) -> None:
+        if self._clear_since_ns is None:
+            self._clear_since_ns = now_ns
+        if self._hold_cause == "fault":
+            if (now_ns - self._clear_since_ns) / 1e9 >= self.config.failsafe.clear_s:
+                self._leave_hold("all is well again", now_ns)
+        elif self._held_s(now_ns) > self._hold_limit_s:
+            self._give_up_hold(self.reason, now_ns)
+
+    def _held_s(self, now_ns: int) -> float:
+        return (now_ns - self.since_ns) / 1e9
+
+    def _give_up_hold(self, word: str, now_ns: int) -> None:
+        if self.config.handheld:
+            return
+        self._go(Next("landing", f"held for {self._held_s(now_ns):.0f} s: {word}"), now_ns)
+
+    def _hold(self, fault: Fault, cause: HoldCause, now_ns: int) -> None:
+        if self.state != "hold" and cause != "restart":
+            self._resume = self.state
+        self._hold_cause, self._hold_limit_s, self._clear_since_ns = cause, fault.hold_s, None
+        self._go(Next("hold", fault.word), now_ns)
+
+    def _leave_hold(self, reason: str, now_ns: int) -> None:
+        target = _RESUME.get(self._resume, self._resume)
+        if target in ("face", "approach", "docked", "undock") and self.board.axis_m is None:
+            target = "select"
+        if self.board.trajectory.fence is None:
+            self._prepare_flight()
+        self._go(Next(target, reason), now_ns)
+
+    def _intent(self, now_ns: int) -> Intent:
+        """Return what the present state wants; follow at most a few transitions in one step."""
+        for _ in range(4):
+            if self.state in ("idle", "landed", "failed", "released"):
+                return Intent("stop", "follow", engage=False)
+            if self.state == "preflight":
+                self._preflight(now_ns)
+                if self.state == "preflight":
+                    return Intent("stop", "follow", engage=False)
+                continue
+            if self.state == "landing":
+                return self._landing(now_ns)
+            if self.state == "hold":
+                blind = self.board.here is None or (self.fault is not None and self.fault.blind)
+                return Intent("stop", "freeze" if blind else "brake")
+            result = STATES[self.state](self.board, self._held_s(now_ns))
+            if isinstance(result, Intent):
+                return result
+            self._go(result, now_ns)
+        return Intent("stop")
+
+    def _preflight(self, now_ns: int) -> None:
+        faults = missing(self.board, self.config)
+        if not faults:
+            self._prepare_flight()
+            self._go(Next("take_off", "preflight passed"), now_ns)
+        elif self._held_s(now_ns) > self.config.preflight_wait_s:
+            self._go(Next("failed", f"preflight: {'; '.join(faults)}"), now_ns)
+
+    def _prepare_flight(self) -> None:
+        here, m = self.board.here, self.config.motion
+        if here is None:
+            return
+        self.board.home_m, self.board.home_yaw_rad = here.position_m.copy(), here.yaw_rad
+        if self._hold_cause == "restart":  # adopted in flight: the map's origin is the start
+            self.board.home_m = np.zeros(3)
+        home = self.board.home_m
+        height = m.fence_height_m + _FLOOR_M
+        self.board.trajectory.fence = Fence(home.copy(), float(home[2]) - _FLOOR_M, m.fence_radius_m, height)
+        self.board.trajectory.reset(here.position_m, here.yaw_rad)
+
+    def _landing(self, now_ns: int) -> Intent:
+        v = self.board.vehicle
+        if self.config.handheld or (v is not None and not v.armed):
+            self._go(Next("landed", f"down and disarmed after {self.reason}"), now_ns)
+            return Intent("stop", "follow", engage=False)
+        return Intent("landing", "freeze" if self.board.here is None else "brake", land=True)
+
+    def _move(self, intent: Intent) -> None:
+        b, t = self.board, self.board.trajectory
+        before = t.yaw_rad
+        if intent.motion == "follow" or self.config.handheld:
+            if b.here is not None:
+                t.reset(b.here.position_m, b.here.yaw_rad)
+        elif intent.motion == "freeze":
+            t.freeze()
+        elif intent.motion == "aim" and intent.aim is not None:
+            t.advance(intent.aim, b.dt_s, None if b.here is None else b.here.position_m)
+        else:
+            t.brake(b.dt_s)
+        if self.state == "scan":
+            b.scan_turned_rad += t.yaw_rad - before
+
+    # -- words --------------------------------------------------------------------------------------------------
+    def _go(self, to: Next, now_ns: int) -> None:
+        if to.state == self.state and to.state != "hold":
+            return
+        self._events.append(Event(now_ns, self.state, to.state, to.reason))
+        if to.state != self.state:
+            self.previous, self.since_ns = self.state, now_ns
+        self.state, self.reason = to.state, to.reason
+
+    def _guidance(self, intent: Intent, now_ns: int) -> Guidance:
+        b, t = self.board, self.board.trajectory
+        last = b.track.latest
+        setpoint = None
+        if last is not None:
+            setpoint = Setpoint(
+                position_m=_vec(t.position_m), yaw_rad=wrap_angle(t.yaw_rad), velocity_m_s=_vec(t.velocity_m_s),
+                yaw_rate_rad_s=float(t.yaw_rate_rad_s),
+            )  # fmt: skip
+        return Guidance(
+            stamp_ns=now_ns, seq=self._seq, map_id=last.map_id if last else "none", command=intent.command,
+            magnitude=float(max(intent.magnitude, 0.0)), unit=intent.unit,
+            engage=intent.engage and not self.config.handheld, land=intent.land, mission_id=self.mission_id,
+            reset_counter=last.reset_counter if last else 0, setpoint=setpoint, reason=self.reason[:500],
+        )  # fmt: skip
+
+    def _report(self, now_ns: int) -> MissionState:
+        b = self.board
+        seen = b.to_axis() if b.target_id is not None else None
+        return MissionState(
+            stamp_ns=now_ns, seq=self._seq, map_id=b.track.latest.map_id if b.track.latest else "none",
+            state=self.state, previous=self.previous, since_ns=self.since_ns, reason=self.reason[:500],
+            target_tree_id=b.target_id, visited_tree_ids=tuple(b.visited_ids), docked_count=b.docked_count,
+            distance_m=None if seen is None else float(seen[0]),
+            heading_error_rad=None if seen is None else float(seen[1]),
+            failsafe=self.fault.name if self.fault is not None else "",
+        )  # fmt: skip
+
+
+def _vec(v: Matrix) -> tuple[float, float, float]:
+    return float(v[0]), float(v[1]), float(v[2])

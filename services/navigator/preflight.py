@@ -1,0 +1,35 @@
+"""What must hold before the propellers turn. Pure."""
+
+from __future__ import annotations
+
+from services.navigator.board import Board
+from services.navigator.config import NavigatorConfig
+
+
+def missing(board: Board, config: NavigatorConfig) -> list[str]:
+    """Return what is not well, in words for the operator; empty when the aircraft may take off."""
+    faults = [] if board.here is not None else ["slam gives no pose"]
+    if config.handheld:
+        return faults
+    v = board.vehicle
+    if v is None:
+        return [*faults, "no word from the autopilot"]
+    if v.armed:
+        faults.append("the vehicle is armed already")
+    if not v.vision_fused:
+        faults.append("the autopilot does not use the vision pose yet")
+    if v.landed in ("in_air", "taking_off", "landing"):
+        faults.append(f"the vehicle says it is {v.landed.replace('_', ' ')}")
+    if v.battery_share is not None and v.battery_share < config.failsafe.battery_start_share:
+        faults.append(
+            f"battery at {100.0 * v.battery_share:.0f} %, {100.0 * config.failsafe.battery_start_share:.0f} needed"
+        )
+    silent = config.failsafe.service_silent_s
+    faults += [
+        f"{name} is dead or hung"
+        for name in ("camera", "slam", "mapper", "detector", "refiner")
+        if name in board.inputs.services and board.inputs.service_age_s(name) > silent
+    ]
+    if config.ground_required and board.inputs.service_age_s("station") > config.failsafe.ground_silent_s:
+        faults.append("no ground station")
+    return faults

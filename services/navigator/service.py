@@ -1,0 +1,123 @@
+"""The navigator process: gathers the latest messages, steps the mission at a fixed rate, answers commands."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import get_args
+
+from schemas.command import Command, CommandName, CommandReply, NonceReply, NonceRequest
+from schemas.health import Health
+from schemas.slam import Pose
+from schemas.topics import (
+    COMMAND,
+    COMMAND_NONCE,
+    HEALTH,
+    MISSION_GUIDANCE,
+    MISSION_STATE,
+    SLAM_POSE,
+    TREES_LIST,
+    TREES_TARGET,
+    VEHICLE_STATE,
+)
+from schemas.trees import Target, TreeList
+from schemas.vehicle import VehicleState
+from services.common.context import Context
+from services.navigator.board import Inputs, Outputs, Seen
+from services.navigator.commands import CommandDesk
+from services.navigator.config import NavigatorConfig
+from services.navigator.mission import Mission
+
+WATCHED = ("camera", "slam", "mapper", "detector", "refiner", "autopilot", "station")
+"""Services whose health the failsafes look at."""
+_STATE_EVERY = 4
+
+
+class Navigator:
+    """Holds the latest of everything and the mission."""
+
+    def __init__(self, context: Context, config: NavigatorConfig) -> None:
+        self._context = context
+        self.mission = Mission(config)
+        self.desk = CommandDesk(config.nonce_valid_s, lambda: os.urandom(16))
+        self._pose: Seen[Pose] | None = None
+        self._trees: Seen[TreeList] | None = None
+        self._target: Seen[Target] | None = None
+        self._vehicle: Seen[VehicleState] | None = None
+        self._services: dict[str, int] = {}
+        self._steps = 0
+
+    def register(self, rate_hz: float) -> None:
+        """Connect to the bus."""
+        c = self._context
+        c.on(SLAM_POSE, self._on_pose)
+        c.on(TREES_LIST, self._on_trees)
+        c.on(TREES_TARGET, self._on_target)
+        c.on(VEHICLE_STATE, self._on_vehicle)
+        for service in WATCHED:
+            c.on(HEALTH, self._on_health, leaf=service)
+        c.answer(COMMAND_NONCE, NonceRequest, self._on_nonce)
+        for name in get_args(CommandName):
+            c.answer(COMMAND, Command, self._on_command_named(name), leaf=name)
+        c.every(1.0 / rate_hz, self.step)
+
+    def step(self) -> None:
+        """Step the mission and publish what it says."""
+        now_ns = self._context.clock.now_ns()
+        inputs = Inputs(now_ns, self._pose, self._trees, self._target, self._vehicle, dict(self._services))
+        with self._context.health.timed("step"):
+            outputs = self.mission.step(inputs)
+        self._publish(outputs)
+
+    def _publish(self, outputs: Outputs) -> None:
+        c = self._context
+        c.publish(MISSION_GUIDANCE, outputs.guidance)
+        self._steps += 1
+        if outputs.events or self._steps % _STATE_EVERY == 0:
+            c.publish(MISSION_STATE, outputs.state)
+        c.health.count("steps")
+        c.health.count("transitions", len(outputs.events))
+        word = outputs.state.failsafe
+        c.health.note("failsafe", f"{word}: {outputs.state.reason}" if word else "")
+
+    def _on_pose(self, pose: Pose) -> None:
+        self._pose = Seen(pose, self._context.clock.now_ns())
+
+    def _on_trees(self, trees: TreeList) -> None:
+        self._trees = Seen(trees, self._context.clock.now_ns())
+
+    def _on_target(self, target: Target) -> None:
+        self._target = Seen(target, self._context.clock.now_ns())
+
+    def _on_vehicle(self, vehicle: VehicleState) -> None:
+        self._vehicle = Seen(vehicle, self._context.clock.now_ns())
+
+    def _on_health(self, health: Health) -> None:
+        self._services[health.service] = self._context.clock.now_ns()
+
+    def _on_nonce(self, request: NonceRequest) -> NonceReply:
+        return self.desk.issue(request.sender, self._context.clock.now_ns())
+
+    def _on_command_named(self, name: CommandName) -> Callable[[Command], CommandReply]:
+        def handle(command: Command) -> CommandReply:
+            return self._on_command(name, command)
+
+        return handle
+
+    def _on_command(self, name: CommandName, command: Command) -> CommandReply:
+        now_ns = self._context.clock.now_ns()
+        reason = self.desk.refusal(command, now_ns)
+        if not reason and command.name != name:
+            reason = f"sent to cmd/{name} but named {command.name}"
+        if reason:
+            self._context.health.count("commands_refused")
+            return CommandReply(accepted=False, reason=reason, state=self.mission.state)
+        verdict = self.mission.order(command.name, command.tree_id, now_ns)
+        self._context.health.count("commands_accepted" if verdict.accepted else "commands_refused")
+        return CommandReply(accepted=verdict.accepted, reason=verdict.reason[:500], state=self.mission.state)
+
+
+def build(context: Context) -> None:
+    """Start the navigator on a context."""
+    config = getattr(context.config, "navigator", None) or NavigatorConfig()
+    Navigator(context, config).register(config.rate_hz)

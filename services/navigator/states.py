@@ -1,0 +1,282 @@
+"""The states of the mission: what each wants while it lasts, and when it ends. Pure.
+
+Each function takes the board and the seconds since entry and returns an intent, or the next state with its reason.
+Entry conditions are the reasons of the transitions that lead there; docs/safety.md tells what interrupts them all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from schemas.navigation import MissionStateName
+from services.common.geometry import Matrix, wrap_angle
+from services.navigator.board import Board, Intent, Next
+from services.navigator.path import clearance_m, plan, standoff
+from services.navigator.selection import choose
+from services.navigator.trajectory import Aim
+
+Result = Intent | Next
+
+_HEIGHT_TOLERANCE_M = 0.12
+_STILL_M_S = 0.15
+_FACING_RAD = float(np.radians(5.0))
+_TURN_FIRST_RAD = float(np.radians(8.0))
+"""Guidance says turn rather than toward beyond this heading error."""
+_CORNER_M = 0.25
+_REPLAN_S = 1.0
+_YAW_CORRECTION_RAD = float(np.radians(8.0))
+
+
+def take_off(b: Board, since_s: float) -> Result:
+    """Entry: preflight passed. Exit: armed, at flight height and still -> scan; not armed or risen in time -> failed."""
+    here, v, c = b.here, b.vehicle, b.config
+    if c.handheld:
+        return Next("scan", "held by a person: no take-off") if here is not None else Intent("stop")
+    flying = v is not None and v.armed and v.mode == "offboard"
+    if not flying:
+        if since_s > c.arm_wait_s:
+            return Next("failed", f"the autopilot did not arm in offboard: {v.note if v else 'no word from it'}")
+        return Intent("take_off", "follow", magnitude=0.0, unit="m")
+    if here is None or b.home_m is None:
+        return Intent("stop", "freeze")
+    left = b.flight_z_m - float(here.position_m[2])
+    speed = float(np.linalg.norm(b.track.velocity_m_s))
+    if abs(left) < _HEIGHT_TOLERANCE_M and speed < _STILL_M_S:
+        return Next("scan", f"at {float(here.position_m[2]) + c.start_height_m:.2f} m above the start")
+    if since_s > c.arm_wait_s + c.takeoff_wait_s:
+        return Next("landing", f"did not reach its height: {left:+.2f} m to go")
+    goal = np.array([b.home_m[0], b.home_m[1], b.flight_z_m])
+    return Intent("take_off", "aim", Aim(goal, b.trajectory.yaw_rad, c.climb_speed_m_s, 0.0), max(left, 0.0), "m")
+
+
+def scan(b: Board, since_s: float) -> Result:
+    """Entry: at flight height. Exit: turned once with overlap and every heading seen -> select; else a second turn."""
+    del since_s
+    c, here = b.config, b.here
+    if here is None:
+        return Intent("stop", "freeze")
+    whole, turned = 2.0 * np.pi + c.scan_overlap_rad, abs(b.scan_turned_rad)
+    if turned >= whole and (b.scan_gaps == 0 or turned >= c.scan_turns_max * 2.0 * np.pi):
+        gaps = f", {b.scan_gaps} of 36 headings unseen" if b.scan_gaps else ""
+        return Next("select", f"turned {np.degrees(turned):.0f} deg{gaps}")
+    left = max(whole - turned, 0.1)
+    aim = Aim(_cruise(b), b.trajectory.yaw_rad + left + 0.2, 0.2, c.scan_rate_rad_s)
+    return Intent("turn_left", "aim", aim, left, "rad")
+
+
+def select(b: Board, since_s: float) -> Result:
+    """Entry: scan done, docked at one of several, or a target given up. Exit: a tree -> face; none -> return or land."""
+    here, c = b.here, b.config
+    if here is None or since_s < c.select_settle_s:
+        return Intent("stop")
+    done = {*b.visited_ids, *b.given_up_ids}
+    choice = choose(b.trees, here.position_m, done, b.done_xy_m, c.select_confidence, b.wanted_id)
+    if choice.tree is not None:
+        b.choose(choice.tree)
+        return Next("face", choice.reason)
+    if since_s < c.select_wait_s and not b.visited_ids:
+        return Intent("stop")
+    return _go_home(b, choice.reason)
+
+
+def face(b: Board, since_s: float) -> Result:
+    """Entry: a target chosen. Exit: it is ahead and tracked (or too far to be) -> approach; not seen -> select."""
+    c, seen = b.config, b.to_axis()
+    if b.axis_m is None:
+        return Next("select", "the target is gone from the map")
+    if b.here is None or seen is None:
+        return Intent("stop", "freeze")
+    distance, bearing = seen
+    still = abs(b.trajectory.yaw_rate_rad_s) < np.radians(2.0)
+    if abs(bearing) < _FACING_RAD and still:
+        if b.target is not None:
+            return Next("approach", f"tree {b.target_id} in sight, {distance:.2f} m ahead")
+        if distance > c.visual_range_m:
+            return Next("approach", f"tree {b.target_id} is {distance:.2f} m ahead by the map: nearer to see it")
+    if since_s > c.face_wait_s + np.pi / c.turn_rate_rad_s:
+        name = b.target_id
+        b.finish_target(visited=False)
+        b.drop_target()
+        return Next("select", f"tree {name} is not seen where the map has it")
+    aim = Aim(_cruise(b), _yaw_to_axis(b), 0.3, c.turn_rate_rad_s)
+    return Intent("turn_left" if bearing > 0.0 else "turn_right", "aim", aim, abs(bearing), "rad")
+
+
+def approach(b: Board, since_s: float) -> Result:
+    """Entry: the target is ahead. Exit: near enough -> dock; no way to it -> select."""
+    del since_s
+    c, here, seen = b.config, b.here, b.to_axis()
+    if b.axis_m is None:
+        return Next("select", "the target is gone from the map")
+    if here is None or seen is None:
+        return Intent("stop", "freeze")
+    distance, bearing = seen
+    goal_xy = _docking_place(b, here.position_m[:2])
+    way = None if goal_xy is None else _way(b, b.trajectory.position_m[:2], goal_xy)
+    if goal_xy is None or way is None:
+        name = b.target_id
+        b.finish_target(visited=False)
+        b.drop_target()
+        return Next("select", f"no clear way to tree {name}")
+    last_leg = len(way) == 1
+    if last_leg and distance <= c.dock.enter_m and abs(bearing) < 2.0 * _FACING_RAD:
+        b.dock.clear()
+        b.dock_direction = (goal_xy - b.axis_m) / float(np.linalg.norm(goal_xy - b.axis_m))
+        b.dock_offset_m = b.dock_yaw_rad = 0.0
+        return Next("dock", f"{distance:.2f} m from tree {b.target_id}")
+    to_go = float(np.linalg.norm(way[0] - here.position_m[:2]))
+    aim = Aim(_at(b, way[0]), _yaw_to_axis(b), c.approach_speed_m_s, c.turn_rate_rad_s, c.approach_gain_per_s)
+    if abs(bearing) > _TURN_FIRST_RAD and last_leg:
+        aim = Aim(_at(b, b.trajectory.position_m[:2]), _yaw_to_axis(b), 0.1, c.turn_rate_rad_s)
+        return Intent("turn_left" if bearing > 0.0 else "turn_right", "aim", aim, abs(bearing), "rad")
+    return Intent("toward", "aim", aim, to_go, "m")
+
+
+def dock(b: Board, since_s: float) -> Result:
+    """Entry: within dock.enter_m. Exit: the 3 s window satisfies design.md section 5 -> docked; pushed off -> approach."""
+    c, seen = b.config, b.to_axis()
+    if b.axis_m is None or b.dock_direction is None:
+        return Next("select", "the target is gone from the map")
+    if b.here is None or seen is None:
+        return Intent("stop", "freeze")
+    distance, bearing = seen
+    if distance > c.dock.leave_m:
+        return Next("approach", f"pushed off to {distance:.2f} m")
+    verdict = b.dock.verdict()
+    if verdict.docked:
+        b.finish_target(visited=True)
+        return Next("docked", f"docked at tree {b.target_id}: {verdict.reason}")
+    if since_s > c.dock.timeout_s:
+        name = b.target_id
+        b.finish_target(visited=False)
+        return Next("undock", f"could not settle at tree {name}: {verdict.reason}")
+    aim = _station(b, distance, bearing)
+    if abs(bearing) > _TURN_FIRST_RAD:
+        return Intent("turn_left" if bearing > 0.0 else "turn_right", "aim", aim, abs(bearing), "rad")
+    gap = distance - c.dock.aim_m
+    if abs(gap) < 0.05:
+        return Intent("stop", "aim", aim)
+    return Intent("toward" if gap > 0.0 else "backward", "aim", aim, abs(gap), "m")
+
+
+def docked(b: Board, since_s: float) -> Result:
+    """Entry: docked. Exit: after dock.hold_s, more trees wanted -> undock; else return or landing."""
+    seen = b.to_axis()
+    if since_s >= b.config.dock.hold_s:
+        if b.docked_count < b.trees_wanted:
+            return Next("undock", f"{b.docked_count} of {b.trees_wanted} trees done")
+        return _go_home(b, f"{b.docked_count} of {b.trees_wanted} trees done")
+    if seen is None or b.axis_m is None or b.dock_direction is None or b.target is None:
+        return Intent("docked", "brake" if b.here is not None else "freeze")
+    return Intent("docked", "aim", _station(b, *seen))
+
+
+def undock(b: Board, since_s: float) -> Result:
+    """Entry: leaving a trunk. Exit: undock_m away -> select, or return when enough are done."""
+    c, here = b.config, b.here
+    if here is None:
+        return Intent("stop", "freeze")
+    if b.axis_m is None or b.dock_direction is None:
+        return Next("select", "the target is gone from the map")
+    left = c.undock_m - float(np.linalg.norm(here.position_m[:2] - b.axis_m))
+    if left < 0.1 or since_s > 20.0:
+        b.drop_target()
+        if b.docked_count >= b.trees_wanted:
+            return _go_home(b, "clear of the trunk")
+        return Next("select", "clear of the trunk")
+    goal = _at(b, b.axis_m + b.dock_direction * c.undock_m)
+    return Intent("backward", "aim", Aim(goal, b.trajectory.yaw_rad, 0.3, 0.0), max(left, 0.0), "m")
+
+
+def return_home(b: Board, since_s: float) -> Result:
+    """Entry: the trees wanted are done. Exit: over the start -> landing; no way or too long -> landing here."""
+    here = b.here
+    if here is None:
+        return Intent("stop", "freeze")
+    if b.home_m is None or b.config.handheld:
+        return Next("landing", "the start is not known in this map")
+    left = float(np.linalg.norm(here.position_m[:2] - b.home_m[:2]))
+    if left < 0.2:
+        return Next("landing", f"back at the start within {left:.2f} m")
+    way = _way(b, b.trajectory.position_m[:2], b.home_m[:2])
+    if way is None or since_s > 120.0:
+        return Next("landing", f"no way back: landing {left:.1f} m from the start")
+    ahead = way[0] - here.position_m[:2]
+    yaw = b.trajectory.unwrapped(float(np.arctan2(ahead[1], ahead[0]))) if left > 0.7 else b.trajectory.yaw_rad
+    turn = wrap_angle(yaw - here.yaw_rad)
+    if abs(turn) > np.radians(30.0):
+        aim = Aim(_at(b, b.trajectory.position_m[:2]), yaw, 0.1, b.config.turn_rate_rad_s)
+        return Intent("turn_left" if turn > 0.0 else "turn_right", "aim", aim, abs(turn), "rad")
+    aim = Aim(_at(b, way[0]), yaw, b.config.motion.max_speed_m_s, b.config.turn_rate_rad_s)
+    return Intent("toward", "aim", aim, left, "m")
+
+
+STATES: dict[MissionStateName, Callable[[Board, float], Result]] = {
+    "take_off": take_off, "scan": scan, "select": select, "face": face, "approach": approach, "dock": dock,
+    "docked": docked, "undock": undock, "return": return_home,
+}  # fmt: skip
+
+
+def _go_home(b: Board, reason: str) -> Next:
+    if b.config.handheld:
+        return Next("landed", reason)
+    if b.config.return_home or b.trees_wanted > 1:
+        if b.axis_m is not None and b.dock_direction is not None:
+            return Next("undock", f"{reason}: away from the trunk first")
+        return Next("return", reason)
+    return Next("landing", reason)
+
+
+def _at(b: Board, xy: Matrix) -> Matrix:
+    return np.array([xy[0], xy[1], b.flight_z_m])
+
+
+def _cruise(b: Board) -> Matrix:
+    """Return the place to hover at: where the setpoint is, at flight height."""
+    return _at(b, b.trajectory.position_m[:2])
+
+
+def _yaw_to_axis(b: Board) -> float:
+    """Return the setpoint yaw (unwrapped) that looks at the axis from where the camera is."""
+    assert b.axis_m is not None
+    assert b.here is not None
+    offset = b.axis_m - b.here.position_m[:2]
+    return b.trajectory.unwrapped(float(np.arctan2(offset[1], offset[0])))
+
+
+def _docking_place(b: Board, from_m: Matrix) -> Matrix | None:
+    """Return x, y of the place in front of the target that keeps clear of the other trunks, or None."""
+    assert b.axis_m is not None
+    place = standoff(b.axis_m, from_m, b.config.dock.aim_m, b.discs(b.config.safety_radius_m))
+    body = b.discs(b.config.aircraft_radius_m + 0.1)
+    return place if clearance_m(place, body) >= 0.0 else None
+
+
+def _way(b: Board, start: Matrix, goal: Matrix) -> list[Matrix] | None:
+    """Return the corners to ``goal``, planned anew once a second or when the map moved."""
+    while b.corners and float(np.linalg.norm(b.corners[0] - start)) < _CORNER_M:
+        b.corners = b.corners[1:]
+    if b.planned_ns < 0 or (b.now_ns - b.planned_ns) / 1e9 > _REPLAN_S:
+        corners = plan(start, goal, b.discs(b.config.safety_radius_m))
+        if corners is None:
+            return None
+        b.corners, b.planned_ns = corners[:-1], b.now_ns
+    return [*b.corners, goal]
+
+
+def _station(b: Board, distance_m: float, bearing_rad: float) -> Aim:
+    """Return the aim in front of the trunk, with the slow correction of standing offsets."""
+    c = b.config
+    assert b.axis_m is not None
+    assert b.dock_direction is not None
+    near = abs(distance_m - c.dock.aim_m) < 0.3
+    if near and b.target is not None and b.target.measured:
+        gain = c.dock.integral_per_s * b.dt_s
+        limit = c.dock.integral_limit_m
+        b.dock_offset_m = float(np.clip(b.dock_offset_m + gain * (c.dock.aim_m - distance_m), -limit, limit))
+        turned = b.dock_yaw_rad + gain * bearing_rad
+        b.dock_yaw_rad = float(np.clip(turned, -_YAW_CORRECTION_RAD, _YAW_CORRECTION_RAD))
+    place = b.axis_m + b.dock_direction * (c.dock.aim_m + b.dock_offset_m)
+    return Aim(_at(b, place), _yaw_to_axis(b) + b.dock_yaw_rad, 0.2, np.radians(15.0), c.approach_gain_per_s)
