@@ -1,0 +1,105 @@
+"""What every benchmark takes and gives, and where each one lives."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import os
+import platform
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+
+from services.common.errors import InputError
+
+BENCHES: dict[str, str] = {
+    "catalogue": "services.evaluate.bench_catalogue",
+    "detection": "services.evaluate.bench_detection",
+    "slam": "services.evaluate.bench_slam",
+    "refine": "services.evaluate.bench_refine",
+    "depth": "services.evaluate.bench_depth",
+    "missions": "services.evaluate.bench_missions",
+    "system": "services.evaluate.bench_system",
+    "station": "services.evaluate.bench_station",
+    "faults": "services.evaluate.bench_faults",
+}
+"""Name of a benchmark -> module with ``run(options: BenchOptions) -> BenchReport``."""
+
+
+@dataclass(frozen=True, slots=True)
+class BenchOptions:
+    """What the user asked for."""
+
+    seed: int | None = None
+    """Fresh scenes drawn from this seed; None: the named ones."""
+    out: Path = Path("bench")
+    """Folder for intermediate results that a later call resumes from."""
+    data: Path = field(default_factory=lambda: Path(os.environ.get("TREEDOCK_DATA", "../shared/data")))
+    """Folder of the real recordings."""
+    scenes: tuple[str, ...] = ()
+    """Names of scenes to do; empty: all."""
+    quick: bool = False
+    """Less data, for a look; figures then say less."""
+    tell: Callable[[str], None] = lambda _: None
+    """Progress, one line at a time."""
+
+
+@dataclass(frozen=True, slots=True)
+class BenchReport:
+    """What came out."""
+
+    figures: Mapping[str, float]
+    conditions: Mapping[str, str]
+    """Sensor, disparity noise s, seeds ...; the machine is added by ``machine``."""
+    table: str
+    """The result as a Markdown table with whatever explains it."""
+
+
+def load_bench(name: str) -> Callable[[BenchOptions], BenchReport]:
+    """Return a benchmark's function.
+
+    Raises:
+        InputError: no such benchmark.
+    """
+    present = [known for known, module in BENCHES.items() if find_spec(module) is not None]
+    if name not in present:
+        raise InputError(f"benchmark {name!r}: expected one of {', '.join(present)}")
+    run: Callable[[BenchOptions], BenchReport] = importlib.import_module(BENCHES[name]).run
+    return run
+
+
+def machine() -> str:
+    """Return a line on the machine the figures were measured on."""
+    model = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        names = [
+            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
+        ]
+        model = names[0] if names else model
+    return f"{model}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, Python {platform.python_version()}"
+
+
+def code_version(packages: tuple[str, ...]) -> str:
+    """Return a hash over the source files of packages (dotted names): results of other code are not reused."""
+    digest = hashlib.sha256()
+    for package in packages:
+        spec = find_spec(package)
+        folders = list(spec.submodule_search_locations or []) if spec else []
+        for folder in folders:
+            for path in sorted(Path(folder).rglob("*.py")):
+                digest.update(str(path.relative_to(folder)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def replace_section(text: str, name: str, section: str) -> str:
+    """Return a Markdown document with its section ``## name`` replaced, or added at the end."""
+    lines = text.splitlines()
+    head = f"## {name}"
+    body = [head, "", *section.strip().splitlines(), ""]
+    if head not in lines:
+        return "\n".join([*lines, *([""] if lines and lines[-1] else []), *body]).rstrip("\n") + "\n"
+    start = lines.index(head)
+    end = next((i for i in range(start + 1, len(lines)) if lines[i].startswith("## ")), len(lines))
+    return "\n".join([*lines[:start], *body, *lines[end:]]).rstrip("\n") + "\n"

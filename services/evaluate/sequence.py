@@ -1,0 +1,71 @@
+"""A recording in, a folder of results out: the work behind ``treedock process``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from services.camera.sources import Source, open_recording
+from services.evaluate import exports
+from services.evaluate.atomic import prepare, write_files
+from services.evaluate.metrics import metrics, metrics_bytes
+from services.evaluate.offline import Counts, OfflineResult, run_offline
+from services.evaluate.report import report_bytes
+
+if TYPE_CHECKING:
+    from services.common.config import TreedockConfig
+
+Progress = Callable[[Counts, Source], None]
+
+
+def process_sequence(
+    sequence: Path,
+    out: Path,
+    config: TreedockConfig,
+    *,
+    camera: Path | None = None,
+    skip_bad_frames: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Run the chain over a recording, write the results into ``out`` and return the metrics.
+
+    Raises:
+        InputError: the recording, the configuration or ``out`` cannot be used; ``out`` is then as it was.
+    """
+    prepare(out)
+    settings = config.camera
+    if camera is not None:
+        settings = settings.model_copy(update={"camera_file": str(camera)})
+    source = open_recording(sequence, settings)
+    _single_threaded()
+    result = run_offline(
+        source, config, skip_bad_frames=skip_bad_frames,
+        progress=None if progress is None else lambda counts: progress(counts, source),
+    )  # fmt: skip
+    values = metrics(result)
+    write_files(out, result_files(sequence.resolve().name, result, values))
+    return values
+
+
+def result_files(title: str, result: OfflineResult, values: dict[str, Any]) -> dict[str, bytes]:
+    """Return the contract's files by name."""
+    return {
+        "trajectory.txt": exports.trajectory_bytes(result.trajectory),
+        "trajectory_online.txt": exports.trajectory_bytes(result.online),
+        "cloud.ply": exports.ply_bytes(result.points_m, result.rgb),
+        "trees.json": exports.trees_json(result.trees, "map"),
+        "trees.csv": exports.trees_csv(result.trees),
+        "trees.geojson": exports.trees_geojson(result.trees, "map"),
+        "targets.jsonl": exports.targets_jsonl(result.targets),
+        "metrics.json": metrics_bytes(values),
+        "report.html": report_bytes(f"treedock: {title}", values, result.trees, result.trajectory),
+    }
+
+
+def _single_threaded() -> None:
+    """OpenCV's threads and random numbers would make runs differ."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    cv2.setRNGSeed(0)
