@@ -210,18 +210,3 @@ def _confidence(candidate: _Candidate) -> float:
     arc = min(1.0, c.arc_rad / 2.4)
     clean = c.points / (c.points + 2.0 * c.inside + 0.3 * c.around)
     return float(np.clip(0.15 + 0.85 * seen * np.sqrt(arc) * clean, 0.0, 1.0))
-
-
-def warm() -> None:
-    """Compile or load every kernel, for both kinds of float, with a small cloud."""
-    angle = np.linspace(0.0, 6.28, 60)
-    height = np.linspace(0.0, 2.4, 60)
-    a, h = (v.ravel() for v in np.meshgrid(angle, height))
-    stem = np.stack([0.1 * np.cos(a), 0.1 * np.sin(a), h], axis=1)
-    g = np.linspace(-1.0, 1.0, 41)
-    gx, gy = (v.ravel() for v in np.meshgrid(g, g))
-    cloud = np.concatenate([stem, np.stack([gx, gy, np.zeros_like(gx)], axis=1)])
-    origins = np.tile(np.array([[3.0, 0.0, 1.5]]), (len(cloud), 1))
-    for kind in (np.float32, np.float64):
-        detect_trees(cloud.astype(kind))
-        detect_trees(cloud.astype(kind), views=Views.of_points(origins))

@@ -1,0 +1,71 @@
+"""The vertical of a cloud that does not say: the axes are tried, then the ground's own normal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.detector.config import DetectorConfig
+from services.detector.detect import detect_trees
+from services.detector.model import DetectionResult
+
+Up = tuple[float, float, float]
+
+_AXES: tuple[tuple[Up, str], ...] = (
+    ((0.0, 0.0, 1.0), "z up"), ((0.0, 1.0, 0.0), "y up"), ((0.0, -1.0, 0.0), "y down"), ((1.0, 0.0, 0.0), "x up"),
+    ((-1.0, 0.0, 0.0), "x down"), ((0.0, 0.0, -1.0), "z down"),
+)  # fmt: skip
+_SAMPLE = 300_000
+_BETTER = 1.5
+"""z is left only for a direction that is so many times better."""
+
+
+@dataclass(frozen=True, slots=True)
+class Vertical:
+    """The chosen direction, and the words that tell how it was found."""
+
+    up: Up
+    how: str
+
+
+def find_vertical(points_m: NDArray[np.float64], config: DetectorConfig | None = None) -> Vertical:
+    """Return the direction in which the cloud looks most like trees on ground; z when none does."""
+    sample = np.ascontiguousarray(points_m[:: max(1, len(points_m) // _SAMPLE)])
+    scores = []
+    for up, name in _AXES:
+        score = _score(detect_trees(sample, up, None, config))
+        scores.append((score / (1.0 if up[2] == 1.0 else _BETTER), up, name))
+    best, up, name = max(scores, key=lambda s: s[0])
+    if best > 0.0:
+        return Vertical(up, f"{name}: most trunks stand that way")
+    normal = ground_normal(sample)
+    if normal is not None and _score(detect_trees(sample, normal, None, config)) > 0.0:
+        return Vertical(normal, "the normal of the largest plane, on which trunks stand")
+    return Vertical((0.0, 0.0, 1.0), "z up is assumed: no direction shows a trunk")
+
+
+def _score(result: DetectionResult) -> float:
+    """Trunks count by confidence; double on ground that is seen, which tells up from down."""
+    return sum(t.confidence for t in result.trunks) * (2.0 if result.ground.seen else 1.0)
+
+
+def ground_normal(points_m: NDArray[np.float64], trials: int = 200) -> Up | None:
+    """Return the unit normal of the plane that holds most points (RANSAC), on the side of most other points."""
+    rng = np.random.default_rng(1)
+    P = points_m[:: max(1, len(points_m) // 20_000)]
+    best, count = None, 0
+    for _ in range(trials):
+        a, b, c = P[rng.integers(0, len(P), 3)]
+        n = np.cross(b - a, c - a)
+        length = float(np.linalg.norm(n))
+        if length < 1e-9:
+            continue
+        d = (P - a) @ (n / length)
+        on = int(np.count_nonzero(np.abs(d) < 0.05))
+        if on > count:
+            off = d[np.abs(d) >= 0.05]
+            side = -1.0 if len(off) and float(np.median(off)) < 0.0 else 1.0
+            best, count = side * n / length, on
+    return None if best is None else (float(best[0]), float(best[1]), float(best[2]))
