@@ -70,7 +70,7 @@ def invoke(arguments: list[str]) -> int:
     except BrokenPipeError:  # the reader of our output went away: `treedock topic echo ... | head`
         sys.stderr.close()
         return EXIT_DONE
-    except Exception:  # the one place where a bug ends
+    except Exception:  # noqa: BLE001 - the one place where a bug ends
         import traceback
 
         traceback.print_exc()

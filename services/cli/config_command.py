@@ -9,9 +9,7 @@ import typer
 from services.cli.options import AsJson, ConfigFile, Port, Settings, loaded
 
 
-def config(
-    *, config: ConfigFile = None, settings: Settings = None, port: Port = None, as_json: AsJson = False
-) -> None:
+def config(*, config: ConfigFile = None, settings: Settings = None, port: Port = None, as_json: AsJson = False) -> None:
     """Print the configuration in force: TOML, each value that is not a default with its origin."""
     from services.common.config_loader import to_toml
 

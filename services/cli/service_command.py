@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -34,27 +35,30 @@ def service_command(name: str) -> Callable[..., int]:
         config: ConfigFile = None,
         settings: Settings = None,
         port: Port = None,
+        parent: Annotated[int | None, typer.Option("--parent", hidden=True)] = None,
         sim_clock: Annotated[bool, typer.Option("--sim-clock", help="Live by the simulator's time.")] = False,
     ) -> int:
+        if parent is not None:
+            _end_with(parent)
         more = {"clock": "sim"} if sim_clock else {}
         return run_by_name(name, config, settings, port, more)
 
     return command
 
 
-def run_by_name(name: str, config: object, settings: list[str] | None, port: int | None, more: dict[str, str]) -> int:
+def run_by_name(
+    name: str, config: Path | None, settings: list[str] | None, port: int | None, more: dict[str, str]
+) -> int:
     """Load the configuration, then the service's module, and run it; service processes end without further ado.
 
     Raises:
         InputError: a configuration or an input that the service cannot use.
     """
-    from pathlib import Path
-
     from services.common.errors import InputError
     from services.common.runtime import run_service
     from services.common.stop import end_process
 
-    tree = loaded(config if isinstance(config, Path) else None, settings, port, more).config
+    tree = loaded(config, settings, port, more).config
     if name == "router":
         from services.router.service import run
 
@@ -66,3 +70,14 @@ def run_by_name(name: str, config: object, settings: list[str] | None, port: int
         code = run_service(name, importlib.import_module(module).build, tree)
     end_process(code)
     return code
+
+
+def _end_with(parent: int) -> None:
+    """Stop when the supervisor that started us ends, also when it already has."""
+    import os
+
+    from services.common.process import die_with_parent
+
+    die_with_parent()
+    if os.getppid() != parent:
+        raise SystemExit(0)

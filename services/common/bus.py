@@ -82,8 +82,10 @@ class Bus:
     def listened(self, topic: Topic, leaf: str | None = None) -> bool:
         """Whether anybody subscribes to the topic at this moment."""
         publisher = self._publisher(topic, topic.key(self.uav, leaf))
-        # an advanced publisher cannot tell, and keeps what it sends for those who come later
-        return not isinstance(publisher, zenoh.Publisher) or publisher.matching_status.matching
+        if not isinstance(publisher, zenoh.Publisher):
+            return True  # an advanced publisher cannot tell, and keeps what it sends for those who come later
+        status: object = publisher.matching_status  # annotated as bool in 1.10.2, but an object with a field
+        return bool(getattr(status, "matching", status))
 
     def _publisher(self, topic: Topic, key: str) -> _Publisher:
         publisher = self._publishers.get(key)

@@ -13,6 +13,7 @@ from services.detector.config import DetectorServiceConfig
 from services.detector.refine.config import RefinerConfig
 from services.navigator.config import NavigatorConfig
 from services.router.config import RouterConfig
+from services.simulator.config import SimulatorConfig
 from services.slam.config import SlamConfig
 
 
@@ -32,6 +33,7 @@ class TreedockConfig(BaseModel):
     slam: SlamConfig = SlamConfig()
     detector: DetectorServiceConfig = DetectorServiceConfig()
     refiner: RefinerConfig = RefinerConfig()
+    simulator: SimulatorConfig = SimulatorConfig()
     navigator: NavigatorConfig = Field(default_factory=NavigatorConfig)
 
 

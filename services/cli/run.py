@@ -1,0 +1,222 @@
+"""``treedock run``: the whole system on this machine, as real processes joined by the bus, watched over to the end."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from services.cli.options import AsJson, ConfigFile, Port, Settings, loaded
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from services.cli.supervisor import Supervisor
+    from services.cli.watch import Watch
+    from services.common.config import TreedockConfig
+    from services.common.stop import StopSignal
+
+_EXIT_INTERRUPTED = 130
+_ROUTER_WITHIN_S = 20.0
+_LOOK_S = 0.2
+
+
+def run(
+    *,
+    source: Annotated[
+        str | None, typer.Option("--source", help="sim, tum:DIR, mcap:FILE or realsense.", metavar="SOURCE")
+    ] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Of the simulated scene and its noise.", min=0)] = None,
+    scene: Annotated[str | None, typer.Option("--scene", help="Name of the simulated scene.")] = None,
+    autopilot: Annotated[
+        str, typer.Option("--autopilot", help="builtin, or udpin:HOST:PORT where a PX4 speaks MAVLink.")
+    ] = "builtin",
+    trees: Annotated[int | None, typer.Option("--trees", help="Trees to dock at.", min=1)] = None,
+    handheld: Annotated[bool, typer.Option("--handheld", help="A person carries the camera.")] = False,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Open no browser.")] = False,
+    logs: Annotated[Path | None, typer.Option("--logs", help="Keep the services' logs in this folder.")] = None,
+    as_json: AsJson = False,
+    config: ConfigFile = None,
+    settings: Settings = None,
+    port: Port = None,
+) -> int:
+    """Run the whole system on this machine, in simulation unless --source says otherwise."""
+    from rich.console import Console
+
+    del no_browser  # the station, which opens one, comes with its own issue
+    _refuse_unknown_autopilot(autopilot)
+    flags = {"camera.source": source, "simulator.seed": seed, "simulator.scene": scene,
+             "navigator.trees_wanted": trees, "navigator.handheld": True if handheld else None}  # fmt: skip
+    tree = loaded(config, settings, port, {k: v for k, v in flags.items() if v is not None}).config
+    tree = with_port(tree, fixed=port is not None)
+    tree = tree.model_copy(update={"clock": "sim" if tree.camera.source == "sim" else "wall"})
+    return Run(tree, Console(stderr=True), logs, as_json=as_json).to_the_end()
+
+
+def _refuse_unknown_autopilot(autopilot: str) -> None:
+    from services.common.errors import InputError
+
+    if autopilot != "builtin":
+        raise InputError(f"--autopilot {autopilot!r}: this version flies only the scripted path, give builtin")
+
+
+def with_port(tree: TreedockConfig, *, fixed: bool) -> TreedockConfig:
+    """Return ``tree`` with a free router port: the configured one, else, unless it is ``fixed``, any.
+
+    Raises:
+        InputError: the fixed port is taken.
+    """
+    from services.common.errors import InputError
+    from services.common.session import free_port, port_is_free
+
+    host, port = tree.router.host, tree.router.port
+    if port_is_free(host, port):
+        return tree
+    if fixed:
+        raise InputError(f"port {port} on {host} is in use: stop what listens there, or choose another with --port")
+    return tree.model_copy(update={"router": tree.router.model_copy(update={"port": free_port(host)})})
+
+
+def services_for(tree: TreedockConfig) -> tuple[str, ...]:
+    """Return the services of a run, in the order in which they start.
+
+    The mission's services (navigator, autopilot, station) join here when a run flies.
+    """
+    chain = ("camera", "slam", "mapper", "detector", "refiner")
+    return ("router", *chain, "simulator") if tree.camera.source == "sim" else ("router", *chain)
+
+
+class Run:
+    """One run, from the router's start to the summary."""
+
+    def __init__(self, tree: TreedockConfig, console: Console, logs: Path | None, *, as_json: bool) -> None:
+        self._tree = tree
+        self._console = console
+        self._as_json = as_json
+        self._keep_logs = logs is not None
+        if logs is not None:
+            logs.mkdir(parents=True, exist_ok=True)
+        self._folder = logs or Path(tempfile.mkdtemp(prefix="treedock-run-"))
+        self._config_file = self._folder / "config.json"
+        self._config_file.write_text(tree.model_dump_json(indent=1))
+
+    def to_the_end(self) -> int:
+        """Run until the source has ended or the user stops it; print the summary and return the exit code.
+
+        Raises:
+            InputError: a service refused its configuration or input; GoalNotReachedError: one could not be kept alive.
+        """
+        from services.cli.supervisor import Supervisor
+        from services.common.logging import set_up
+        from services.common.stop import StopSignal
+
+        set_up("run", "warning" if self._console.is_terminal else self._tree.log_level)
+        stop = StopSignal()
+        stop.install(force=False)
+        supervisor = Supervisor(services_for(self._tree), self._spawn, self._tree.supervisor)
+        try:
+            return self._supervised(supervisor, stop)
+        finally:
+            supervisor.stop_all()
+            if not self._keep_logs and supervisor.restarts == 0:
+                shutil.rmtree(self._folder, ignore_errors=True)
+
+    def _spawn(self, name: str) -> subprocess.Popen[bytes]:
+        """Start a service as a process group of its own: Ctrl-C in the terminal reaches it through us alone."""
+        command = [sys.executable, "-m", "services.cli.app", name, "--config", str(self._config_file),
+                   "--parent", str(os.getpid())]  # fmt: skip
+        # the file already holds what variables and flags said
+        environment = {k: v for k, v in os.environ.items() if not k.startswith("TREEDOCK_") or k == "TREEDOCK_DATA"}
+        with (self._folder / f"{name}.log").open("ab") as log:
+            return subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, process_group=0
+            )
+
+    def _supervised(self, supervisor: Supervisor, stop: StopSignal) -> int:
+        from services.cli.status import Status
+        from services.cli.watch import Watch
+        from services.common.session import opened_client
+
+        begin_s = time.monotonic()
+        supervisor.check()
+        with ExitStack() as stack:
+            endpoint = self._tree.router.endpoint
+            waiting = self._still_waiting(supervisor, stop)
+            session = stack.enter_context(opened_client(endpoint, waiting, wait_s=_ROUTER_WITHIN_S))
+            watch = Watch(session, self._tree.uav, lambda h: supervisor.heard(h.service, h.pid, h.state))
+            with Status(watch, supervisor, self._console) as status:
+                self._console.print(f"treedock: router on {endpoint}, logs in {self._folder}", highlight=False)
+                self._watch_over(supervisor, watch, status.update, stop)
+            values = self._close(watch, supervisor, time.monotonic() - begin_s)
+            self._print(watch, values)
+        return _EXIT_INTERRUPTED if stop.is_set else 0
+
+    def _still_waiting(self, supervisor: Supervisor, stop: StopSignal) -> Callable[[], bool]:
+        def given_up() -> bool:
+            supervisor.check()
+            self._raise_if_given_up(supervisor)
+            return stop.is_set
+
+        return given_up
+
+    def _watch_over(self, supervisor: Supervisor, watch: Watch, show: Callable[[], None], stop: StopSignal) -> None:
+        """Look after the services until the source has ended and its last frames are worked off, or until the stop."""
+        ended_s: float | None = None
+        while not stop.is_set:
+            watch.pump(_LOOK_S)
+            supervisor.check()
+            self._raise_if_given_up(supervisor)
+            show()
+            if watch.source_ended:
+                ended_s = ended_s or time.monotonic()
+                late = time.monotonic() - ended_s > self._tree.supervisor.drain_within_s
+                if watch.drained or late:
+                    return
+
+    def _raise_if_given_up(self, supervisor: Supervisor) -> None:
+        from services.common.errors import GoalNotReachedError, InputError
+
+        child = supervisor.given_up
+        if child is None:
+            return
+        self._keep_logs = True
+        last = _last_line(self._folder / f"{child.name}.log").removeprefix("treedock: ")
+        if child.last_fault.endswith("exit code 2"):
+            raise InputError(last)
+        raise GoalNotReachedError(f"{child.name} {child.last_fault} {child.deaths_in_a_row} times before it was ready: "
+                                  f"{last} (all of it in {self._folder / child.name}.log)")  # fmt: skip
+
+    def _close(self, watch: Watch, supervisor: Supervisor, duration_s: float) -> dict[str, Any]:
+        from services.cli.summary import figures
+
+        values = figures(watch, supervisor, duration_s)
+        if supervisor.restarts and not self._keep_logs:
+            values["logs"] = str(self._folder)
+        return values
+
+    def _print(self, watch: Watch, values: dict[str, Any]) -> None:
+        from rich.console import Console
+
+        from services.cli.summary import closing_line, tree_table
+
+        if self._as_json:
+            typer.echo(json.dumps(values))
+            return
+        console = Console()
+        console.print(tree_table(watch.trees, watch.truth))
+        console.print(f"treedock: {closing_line(values)}", highlight=False, soft_wrap=True)
+
+
+def _last_line(path: Path) -> str:
+    lines = path.read_text(errors="replace").strip().splitlines() if path.exists() else []
+    return lines[-1] if lines else "it said nothing"
