@@ -40,10 +40,10 @@ class Cone:
         return np.array([self.x + self.lean[0] * z, self.y + self.lean[1] * z])
 
     def expected(
-        self, id: int = 0, shift: tuple[float, float] = (0.0, 0.0), sigma: float = 0.05, radius_error: float = 0.0
+        self, tree_id: int = 0, shift: tuple[float, float] = (0.0, 0.0), sigma: float = 0.05, radius_error: float = 0.0
     ) -> ExpectedTree:
         return ExpectedTree(
-            id, self.x + shift[0], self.y + shift[1], 0.0, self.axis, self.radius + radius_error, sigma, 0.01
+            tree_id, self.x + shift[0], self.y + shift[1], 0.0, self.axis, self.radius + radius_error, sigma, 0.01
         )
 
 

@@ -172,7 +172,7 @@ def fit_object(
     if not good or stats[0] < 3:
         return None
     rms = float(np.sqrt(stats[1] / stats[0]))
-    covariance = np.linalg.inv(H) * fit.correlation * max(1.0, rms * rms)
+    covariance = np.asarray(np.linalg.inv(H) * (fit.correlation * max(1.0, rms * rms)), dtype=np.float64)
     return Fit(k, p, covariance, int(stats[0]), float(stats[0] / stats[2]), rms)
 
 

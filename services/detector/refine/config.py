@@ -79,13 +79,16 @@ class FilterConfig(BaseModel):
 
     gate: float = Field(default=4.0, gt=0.0)
     """Innovations beyond this many sigma are not believed."""
-    image_x_accel_px_s2: float = Field(default=400.0, gt=0.0)
-    range_accel_m_s2: float = Field(default=0.5, gt=0.0)
+    image_x_accel_px_s2: float = Field(default=60.0, gt=0.0)
+    """What the camera's known motion leaves unexplained."""
+    range_accel_m_s2: float = Field(default=0.15, gt=0.0)
+    blind_factor: float = Field(default=15.0, ge=1.0)
+    """So many times larger are the accelerations while the camera's motion is not known."""
     radius_rate_m_s: float = Field(default=0.002, gt=0.0)
     lost_after_s: float = Field(default=0.5, gt=0.0)
     """Predictions are published as tracking for this long after the last measurement."""
     restart_after: int = Field(default=3, ge=1)
-    """So many refused measurements in a row that agree with each other start the filters anew."""
+    """So many refused measurements in a row start the filters anew: then the filters are wrong, not they."""
 
 
 class RefinerConfig(BaseModel):

@@ -37,7 +37,9 @@ def refine(
         return None
     shift = _NO_POSE_ERROR
     if pose_covariance is not None:
-        shift = pose_offset_covariance(expected, view.camera_m, pose_covariance)
+        shift = pose_offset_covariance(
+            axis_point(expected, float(view.camera_m[2])) - view.camera_m[:2], pose_covariance
+        )
     gate = gate_m(np.eye(2) * expected.sigma_xy_m**2 + shift, config.search)
     reach = gate + expected.radius_m
     bounds = window(expected, T_map_camera, intrinsics, reach, config.search)

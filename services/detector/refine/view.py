@@ -72,18 +72,13 @@ def axis_point(tree: ExpectedTree, z_map_m: float) -> Matrix:
     return np.array([tree.x_m + s * ax, tree.y_m + s * ay])
 
 
-def expected_covariance(tree: ExpectedTree, camera_m: Matrix, pose_covariance: Matrix | None) -> Matrix:
-    """Return the (2, 2) covariance of tree minus camera as the camera sees it: the map's and the pose's.
+def pose_offset_covariance(offset_m: Matrix, pose_covariance: Matrix) -> Matrix:
+    """Return the (2, 2) covariance in map of a place ``offset_m`` (2,) from the camera that the pose alone causes.
 
-    A rotation error r of the camera (left perturbation, map frame) turns the offset o by r x o.
+    A rotation error r of the camera (left perturbation, map frame) turns the offset o by r x o. The error is common to
+    all trees nearby.
     """
-    cov = np.eye(2) * tree.sigma_xy_m**2
-    return cov if pose_covariance is None else cov + pose_offset_covariance(tree, camera_m, pose_covariance)
-
-
-def pose_offset_covariance(tree: ExpectedTree, camera_m: Matrix, pose_covariance: Matrix) -> Matrix:
-    """Return the part of the covariance of a tree's offset that the pose alone causes, common to all trees nearby."""
-    ox, oy = axis_point(tree, float(camera_m[2])) - camera_m[:2]
+    ox, oy = offset_m
     J = np.array([[1.0, 0.0, 0.0, 0.0, 0.0, -oy], [0.0, 1.0, 0.0, 0.0, 0.0, ox]])
     return J @ pose_covariance @ J.T
 
@@ -133,3 +128,46 @@ def window_rows(v0: int, v1: int, count: int) -> NDArray[np.int64]:
     """Return up to ``count`` rows evenly spread over v0..v1."""
     step = max(1, (v1 - v0 + 1) // count)
     return np.arange(v0, v1 + 1, step, dtype=np.int64)
+
+
+def bearing_of_column(column_px: float, T_map_camera: Matrix, intrinsics: Intrinsics) -> tuple[float, float]:
+    """Return the bearing at which the horizontal plane through the camera meets an image column, and |du/dbearing|.
+
+    Bearings are from the camera's forward direction on the horizontal, positive to the left. For a level camera this
+    is ``-atan((u - cx) / fx)``; for a tilted one the horizon's pixels lie on a slanted line.
+    """
+    R = T_map_camera[:3, :3]
+    forward = R[:2, 2] / np.hypot(R[0, 2], R[1, 2])
+    a = forward[0] * R[0] + forward[1] * R[1]
+    b = -forward[1] * R[0] + forward[0] * R[1]
+    x = (column_px - intrinsics.cx) / intrinsics.fx
+    if intrinsics.distorted:
+        x = _undistorted_x(x, a, b, intrinsics)
+    bearing = float(np.arctan((x * a[2] - a[0]) / (b[0] - x * b[2])))
+    c, s = np.cos(bearing), np.sin(bearing)
+    n, d = a[0] * c + b[0] * s, a[2] * c + b[2] * s
+    slope = ((b[0] * c - a[0] * s) * d - n * (b[2] * c - a[2] * s)) / d**2
+    return bearing, float(abs(slope)) * intrinsics.fx
+
+
+def _undistorted_x(x_distorted: float, a: Matrix, b: Matrix, intrinsics: Intrinsics) -> float:
+    """Return the undistorted x of a horizon pixel by fixed-point iteration."""
+    x = x_distorted
+    for _ in range(_UNDISTORT_ITERATIONS):
+        bearing = np.arctan((x * a[2] - a[0]) / (b[0] - x * b[2]))
+        direction = a * np.cos(bearing) + b * np.sin(bearing)
+        dx, _ = distort(direction[0] / direction[2], direction[1] / direction[2], intrinsics)
+        x += x_distorted - float(dx)
+    return x
+
+
+def place_in_map(
+    bearing_rad: float, range_m: float, variances: tuple[float, float], T_map_camera: Matrix
+) -> tuple[Matrix, Matrix]:
+    """Return a place (2,) in map from bearing and range, and its (2, 2) covariance from ``variances`` of the two."""
+    forward = T_map_camera[:2, 2] / np.hypot(T_map_camera[0, 2], T_map_camera[1, 2])
+    left = np.array([-forward[1], forward[0]])
+    away = np.cos(bearing_rad) * forward + np.sin(bearing_rad) * left
+    across = np.array([-away[1], away[0]])
+    covariance = variances[1] * np.outer(away, away) + variances[0] * range_m**2 * np.outer(across, across)
+    return T_map_camera[:2, 3] + range_m * away, covariance

@@ -1,0 +1,101 @@
+"""One-dimensional constant-velocity Kalman filters (spec equations 17 to 21) for image x, range and radius."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from services.detector.refine.config import FilterConfig
+
+
+class Filter1D:
+    """A quantity and its rate of change; filterpy does the sums.
+
+    The camera's known motion enters as a control input, so that the rate holds only what that leaves unexplained.
+    Process noise: a constant acceleration over each step (Bar-Shalom, Li, Kirubarajan 2001, section 6.3.2).
+    """
+
+    def __init__(self, value: float, variance: float, rate_variance: float) -> None:
+        from filterpy.kalman import KalmanFilter
+
+        self._kalman: Any = KalmanFilter(dim_x=2, dim_z=1)
+        self._kalman.x = np.array([[value], [0.0]])
+        self._kalman.P = np.diag([variance, rate_variance])
+        self._kalman.H = np.array([[1.0, 0.0]])
+        self._kalman.B = np.array([[1.0], [0.0]])
+
+    @property
+    def value(self) -> float:
+        """Return the present estimate."""
+        return float(self._kalman.x[0, 0])
+
+    @property
+    def variance(self) -> float:
+        """Return its variance."""
+        return float(self._kalman.P[0, 0])
+
+    def predict(self, dt_s: float, moved: float, acceleration: float) -> None:
+        """Move on by ``dt_s``, during which the camera's motion changed the quantity by ``moved``."""
+        kalman = self._kalman
+        kalman.F = np.array([[1.0, dt_s], [0.0, 1.0]])
+        gain = np.array([[0.5 * dt_s * dt_s], [dt_s]])
+        kalman.Q = gain @ gain.T * acceleration**2
+        kalman.predict(u=np.array([[moved]]))
+
+    def surprise(self, value: float, variance: float) -> float:
+        """Return how many sigma a measurement is away from the prediction."""
+        return float(abs(value - self.value) / np.sqrt(self.variance + variance))
+
+    def update(self, value: float, variance: float) -> None:
+        """Take in a measurement."""
+        self._kalman.update(value, R=variance)
+
+
+class TargetFilter:
+    """The three filters of one target, gated together: a measurement is believed as a whole or not at all."""
+
+    def __init__(
+        self, values: tuple[float, float, float], variances: tuple[float, float, float], config: FilterConfig
+    ) -> None:
+        self._config = config
+        rates = (10.0 * config.image_x_accel_px_s2, config.range_accel_m_s2, config.radius_rate_m_s**2)
+        self._filters = [Filter1D(*arguments) for arguments in zip(values, variances, rates, strict=True)]
+        self._refused = 0
+
+    @property
+    def values(self) -> tuple[float, float, float]:
+        """Return image x (px), range (m), radius (m)."""
+        x, distance, radius = (f.value for f in self._filters)
+        return x, max(distance, 0.0), max(radius, 0.0)
+
+    @property
+    def variances(self) -> tuple[float, float, float]:
+        """Return the variances of ``values``."""
+        x, distance, radius = (f.variance for f in self._filters)
+        return x, distance, radius
+
+    def predict(self, dt_s: float, moved: tuple[float, float] | None) -> None:
+        """Move on; ``moved``: change of image x and range by the camera's motion, None when that is not known."""
+        config = self._config
+        factor = 1.0 if moved is not None else config.blind_factor
+        x, distance = moved if moved is not None else (0.0, 0.0)
+        self._filters[0].predict(dt_s, x, config.image_x_accel_px_s2 * factor)
+        self._filters[1].predict(dt_s, distance, config.range_accel_m_s2 * factor)
+        self._filters[2].predict(dt_s, 0.0, config.radius_rate_m_s)
+
+    def update(self, values: tuple[float, float, float], variances: tuple[float, float, float]) -> bool:
+        """Take in a measurement when it is believable; tell whether it was."""
+        triples = list(zip(self._filters, values, variances, strict=True))
+        if any(f.surprise(value, variance) > self._config.gate for f, value, variance in triples):
+            self._refused += 1
+            return False
+        self._refused = 0
+        for f, value, variance in triples:
+            f.update(value, variance)
+        return True
+
+    @property
+    def hopeless(self) -> bool:
+        """Whether so many measurements in a row were refused that the filter itself must be wrong."""
+        return self._refused >= self._config.restart_after

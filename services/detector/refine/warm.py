@@ -1,0 +1,27 @@
+"""Compiles or loads every kernel, so that the first frame is as fast as the others."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from schemas.camera import Intrinsics
+from services.detector.refine.config import RefinerConfig
+from services.detector.refine.kalman import TargetFilter
+from services.detector.refine.model import ExpectedTree
+from services.detector.refine.refine import refine
+
+_LEVEL = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+def warm() -> None:
+    """Run the refiner once on a small made-up trunk, and the filters once."""
+    intrinsics = Intrinsics(width=64, height=48, fx=50.0, fy=50.0, cx=31.5, cy=23.5)
+    depth = np.zeros((48, 64), np.float32)
+    x = (np.arange(64) - 31.5) / 50.0
+    column = 2.0 - np.sqrt(np.maximum(0.2**2 - (2.0 * x) ** 2, 0.0))
+    depth[:, np.abs(x) < 0.095] = column[np.abs(x) < 0.095]
+    tree = ExpectedTree(0, 2.0, 0.0, 0.0, (0.0, 0.0, 1.0), 0.2, 0.05, 0.01)
+    refine(depth, intrinsics, _LEVEL, np.eye(6) * 1e-4, tree, [], RefinerConfig())
+    filters = TargetFilter((0.0, 2.0, 0.1), (1.0, 1e-4, 1e-4), RefinerConfig().filter)
+    filters.predict(0.1, (0.0, 0.0))
+    filters.update((0.0, 2.0, 0.1), (1.0, 1e-4, 1e-4))
