@@ -114,7 +114,7 @@ class Chain:
         slam, mapper, detector = self.finish()
         cloud = mapper.cloud()
         return OfflineResult(
-            counts=self.counts, trajectory=list(slam.slam.final_trajectory()), online=self._online,
+            counts=self.counts, trajectory=[] if slam.slam is None else list(slam.slam.final_trajectory()), online=self._online,
             points_m=cloud.points_m, rgb=cloud.rgb, trees=list(detector.final_trees()), targets=self._targets,
             stage_ms=self._stages(), counters=self._counters(), duration_s=duration_s,
         )  # fmt: skip
