@@ -32,6 +32,9 @@ from services.evaluate.exports import Stamped
 SETTLE_S = 3.0
 """Time that passes after the last frame: timers of the services fire, the last corrections reach the map."""
 
+_NO_POINTS = np.empty((0, 3), np.float32)
+_NO_COLOURS = np.empty((0, 3), np.uint8)
+
 Builder = Callable[[Context], Any]
 """A service's ``build``; what it returns is asked for the final results."""
 
@@ -104,20 +107,24 @@ class Chain:
         self._frame_ms.append((time.perf_counter() - begin) * 1e3)
         self.counts.frames += 1
 
-    def finish(self) -> tuple[Any, Any, Any]:
-        """Let the chain come to rest; return what slam, mapper and detector were built as."""
-        self._hub.advance_to(self._hub.clock.now_ns() + round(SETTLE_S * 1e9))
-        return self._services["slam"], self._services["mapper"], self._services["detector"]
-
     def result(self, duration_s: float) -> OfflineResult:
-        """Collect the final estimates."""
-        slam, mapper, detector = self.finish()
-        cloud = mapper.cloud()
+        """Let the chain come to rest and collect the final estimates; a service left out contributes nothing."""
+        self._hub.advance_to(self._hub.clock.now_ns() + round(SETTLE_S * 1e9))
+        slam, mapper, detector = (self._services.get(name) for name in ("slam", "mapper", "detector"))
+        started = slam is not None and slam.slam is not None
+        cloud = None if mapper is None else mapper.cloud()
         return OfflineResult(
-            counts=self.counts, trajectory=[] if slam.slam is None else list(slam.slam.final_trajectory()), online=self._online,
-            points_m=cloud.points_m, rgb=cloud.rgb, trees=list(detector.final_trees()), targets=self._targets,
-            stage_ms=self._stages(), counters=self._counters(), duration_s=duration_s,
-        )  # fmt: skip
+            counts=self.counts,
+            trajectory=list(slam.slam.final_trajectory()) if started else [],
+            online=self._online,
+            points_m=_NO_POINTS if cloud is None else cloud.points_m,
+            rgb=_NO_COLOURS if cloud is None else cloud.rgb,
+            trees=[] if detector is None else list(detector.final_trees()),
+            targets=self._targets,
+            stage_ms=self._stages(),
+            counters=self._counters(),
+            duration_s=duration_s,
+        )
 
     def _on_pose(self, pose: Pose) -> None:
         if pose.T_map_camera is not None:
@@ -154,7 +161,7 @@ def run_offline(
     Args:
         frames: a source; stamps must rise.
         config: of every service.
-        builders: the services by name (slam, mapper, detector, refiner); the real ones by default.
+        builders: the services by name (slam, mapper, detector, refiner, or some of them); by default the real ones.
         skip_bad_frames: go on past frames that cannot be used, and count them.
         progress: called after each frame with the counts so far.
 
