@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import cast
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from schemas.slam import Pose
 from schemas.topics import CAMERA_RGBD, SLAM_POSE, TREES_LIST, TREES_TARGET
 from schemas.trees import Target, Tree, TreeList
 from services.common.config import TreedockConfig
+from services.common.context import Context
 from services.common.geometry import Matrix, to_transform
 from services.common.memory import Hub, MemoryContext
 from services.detector.refine.service import build
@@ -26,7 +28,7 @@ class Rig:
         self.context: MemoryContext = self.hub.context("refiner")
         self.sender = self.hub.context("test")
         self.targets: list[Target] = []
-        build(self.context)
+        build(cast("Context", self.context))
         self.sender.on(TREES_TARGET, self.targets.append)
 
     def trees(self, map_id: str = "m1", cones: tuple[Cone, ...] = (CONE,)) -> None:
