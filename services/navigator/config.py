@@ -12,17 +12,17 @@ class MotionConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    max_speed_m_s: float = Field(0.5, gt=0.0, le=2.0)
-    max_accel_m_s2: float = Field(0.5, gt=0.0)
-    max_jerk_m_s3: float = Field(2.0, gt=0.0)
-    max_yaw_rate_rad_s: float = Field(math.radians(30.0), gt=0.0)
-    max_yaw_accel_rad_s2: float = Field(math.radians(40.0), gt=0.0)
-    leash_m: float = Field(0.6, gt=0.0)
+    max_speed_m_s: float = Field(default=0.5, gt=0.0, le=2.0)
+    max_accel_m_s2: float = Field(default=0.5, gt=0.0)
+    max_jerk_m_s3: float = Field(default=2.0, gt=0.0)
+    max_yaw_rate_rad_s: float = Field(default=math.radians(30.0), gt=0.0)
+    max_yaw_accel_rad_s2: float = Field(default=math.radians(40.0), gt=0.0)
+    leash_m: float = Field(default=0.6, gt=0.0)
     """The setpoint stops running ahead when the aircraft is this far behind it."""
-    fence_radius_m: float = Field(12.0, gt=0.0)
+    fence_radius_m: float = Field(default=12.0, gt=0.0)
     """Geofence: horizontal distance from the start."""
-    fence_height_m: float = Field(3.0, gt=0.0)
-    fence_margin_m: float = Field(0.7, gt=0.0)
+    fence_height_m: float = Field(default=3.0, gt=0.0)
+    fence_margin_m: float = Field(default=0.7, gt=0.0)
     """The failsafe acts when the aircraft itself is this far outside."""
 
 
@@ -31,24 +31,24 @@ class DockConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    aim_m: float = Field(0.95, gt=0.0)
-    min_m: float = Field(0.85, gt=0.0)
-    max_m: float = Field(1.00, gt=0.0)
-    bearing_rad: float = Field(math.radians(3.0), gt=0.0)
-    window_s: float = Field(3.0, gt=0.0)
-    still_m: float = Field(0.12, gt=0.0)
+    aim_m: float = Field(default=0.95, gt=0.0)
+    min_m: float = Field(default=0.85, gt=0.0)
+    max_m: float = Field(default=1.00, gt=0.0)
+    bearing_rad: float = Field(default=math.radians(3.0), gt=0.0)
+    window_s: float = Field(default=3.0, gt=0.0)
+    still_m: float = Field(default=0.12, gt=0.0)
     """Not moving: how far the camera may wander within the window."""
-    drift_m_s: float = Field(0.05, gt=0.0)
+    drift_m_s: float = Field(default=0.05, gt=0.0)
     """Not moving: the slope of the camera's position over the window."""
-    enter_m: float = Field(1.15, gt=0.0)
+    enter_m: float = Field(default=1.15, gt=0.0)
     """Approach ends and dock begins at this distance."""
-    leave_m: float = Field(1.5, gt=0.0)
+    leave_m: float = Field(default=1.5, gt=0.0)
     """Dock falls back to approach beyond this distance."""
-    integral_per_s: float = Field(0.25, ge=0.0)
+    integral_per_s: float = Field(default=0.25, ge=0.0)
     """Slow correction of a standing offset between setpoint and camera; 0 switches it off."""
-    integral_limit_m: float = Field(0.20, ge=0.0)
-    timeout_s: float = Field(60.0, gt=0.0)
-    hold_s: float = Field(4.0, ge=0.0)
+    integral_limit_m: float = Field(default=0.20, ge=0.0)
+    timeout_s: float = Field(default=60.0, gt=0.0)
+    hold_s: float = Field(default=4.0, ge=0.0)
     """Hover after docking before what follows."""
 
     @model_validator(mode="after")
@@ -63,29 +63,29 @@ class FailsafeConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    pose_silent_s: float = Field(0.4, gt=0.0)
-    pose_hold_s: float = Field(4.0, gt=0.0)
+    pose_silent_s: float = Field(default=0.4, gt=0.0)
+    pose_hold_s: float = Field(default=4.0, gt=0.0)
     """Shorter than the 5 s for which PX4 drifts unnoticed without vision."""
-    pose_jump_m: float = Field(0.4, gt=0.0)
-    pose_jump_rad: float = Field(math.radians(15.0), gt=0.0)
-    correction_hold_m: float = Field(1.0, gt=0.0)
+    pose_jump_m: float = Field(default=0.4, gt=0.0)
+    pose_jump_rad: float = Field(default=math.radians(15.0), gt=0.0)
+    correction_hold_m: float = Field(default=1.0, gt=0.0)
     """A told correction larger than this is held upon like a jump."""
-    target_lost_s: float = Field(0.4, gt=0.0)
-    target_hold_s: float = Field(10.0, gt=0.0)
-    trees_stale_s: float = Field(120.0, gt=0.0)
-    trees_hold_s: float = Field(15.0, gt=0.0)
-    service_silent_s: float = Field(3.5, gt=0.0)
-    service_hold_s: float = Field(20.0, gt=0.0)
-    vehicle_silent_s: float = Field(0.5, gt=0.0)
-    vehicle_hold_s: float = Field(5.0, gt=0.0)
-    ground_silent_s: float = Field(5.0, gt=0.0)
-    ground_hold_s: float = Field(30.0, gt=0.0)
-    battery_start_share: float = Field(0.40, ge=0.0, le=1.0)
-    battery_land_share: float = Field(0.20, ge=0.0, le=1.0)
-    obstacle_hold_s: float = Field(10.0, gt=0.0)
-    restart_hold_s: float = Field(5.0, gt=0.0)
-    operator_hold_s: float = Field(180.0, gt=0.0)
-    clear_s: float = Field(1.0, ge=0.0)
+    target_lost_s: float = Field(default=0.4, gt=0.0)
+    target_hold_s: float = Field(default=10.0, gt=0.0)
+    trees_stale_s: float = Field(default=120.0, gt=0.0)
+    trees_hold_s: float = Field(default=15.0, gt=0.0)
+    service_silent_s: float = Field(default=3.5, gt=0.0)
+    service_hold_s: float = Field(default=20.0, gt=0.0)
+    vehicle_silent_s: float = Field(default=0.5, gt=0.0)
+    vehicle_hold_s: float = Field(default=5.0, gt=0.0)
+    ground_silent_s: float = Field(default=5.0, gt=0.0)
+    ground_hold_s: float = Field(default=30.0, gt=0.0)
+    battery_start_share: float = Field(default=0.40, ge=0.0, le=1.0)
+    battery_land_share: float = Field(default=0.20, ge=0.0, le=1.0)
+    obstacle_hold_s: float = Field(default=10.0, gt=0.0)
+    restart_hold_s: float = Field(default=5.0, gt=0.0)
+    operator_hold_s: float = Field(default=180.0, gt=0.0)
+    clear_s: float = Field(default=1.0, ge=0.0)
     """A fault must be gone for this long before the mission goes on."""
 
 
@@ -99,36 +99,36 @@ class NavigatorConfig(BaseModel):
     failsafe: FailsafeConfig = FailsafeConfig()
     handheld: bool = False
     """A person carries the camera: guidance is shown, no vehicle is asked or commanded."""
-    trees_wanted: int = Field(1, ge=1, le=100)
+    trees_wanted: int = Field(default=1, ge=1, le=100)
     return_home: bool = False
     """Fly back to the start before landing; always done after more than one tree."""
-    rate_hz: float = Field(20.0, ge=5.0, le=100.0)
-    start_height_m: float = Field(0.1, ge=0.0)
+    rate_hz: float = Field(default=20.0, ge=5.0, le=100.0)
+    start_height_m: float = Field(default=0.1, ge=0.0)
     """Camera above ground at the start (the map's origin)."""
-    flight_height_m: float = Field(1.5, gt=0.0)
-    min_ground_m: float = Field(1.0, gt=0.0)
+    flight_height_m: float = Field(default=1.5, gt=0.0)
+    min_ground_m: float = Field(default=1.0, gt=0.0)
     """Least height over the ground at the target's foot: the aircraft rises on a slope."""
-    climb_speed_m_s: float = Field(0.4, gt=0.0)
-    scan_rate_rad_s: float = Field(math.radians(25.0), gt=0.0)
-    scan_overlap_rad: float = Field(math.radians(20.0), ge=0.0)
-    scan_turns_max: float = Field(2.2, ge=1.0)
-    turn_rate_rad_s: float = Field(math.radians(25.0), gt=0.0)
-    approach_speed_m_s: float = Field(0.35, gt=0.0)
-    approach_gain_per_s: float = Field(0.5, gt=0.0)
+    climb_speed_m_s: float = Field(default=0.4, gt=0.0)
+    scan_rate_rad_s: float = Field(default=math.radians(25.0), gt=0.0)
+    scan_overlap_rad: float = Field(default=math.radians(20.0), ge=0.0)
+    scan_turns_max: float = Field(default=2.2, ge=1.0)
+    turn_rate_rad_s: float = Field(default=math.radians(25.0), gt=0.0)
+    approach_speed_m_s: float = Field(default=0.35, gt=0.0)
+    approach_gain_per_s: float = Field(default=0.5, gt=0.0)
     """Speed per metre still to go: the closer, the slower."""
-    visual_range_m: float = Field(4.0, gt=0.0)
+    visual_range_m: float = Field(default=4.0, gt=0.0)
     """Within this distance of the trunk the approach needs the target in sight; beyond it the map will do."""
-    select_settle_s: float = Field(2.0, ge=0.0)
-    select_wait_s: float = Field(15.0, gt=0.0)
-    select_confidence: float = Field(0.3, ge=0.0, le=1.0)
-    face_wait_s: float = Field(10.0, gt=0.0)
-    undock_m: float = Field(1.8, gt=0.0)
+    select_settle_s: float = Field(default=2.0, ge=0.0)
+    select_wait_s: float = Field(default=15.0, gt=0.0)
+    select_confidence: float = Field(default=0.3, ge=0.0, le=1.0)
+    face_wait_s: float = Field(default=10.0, gt=0.0)
+    undock_m: float = Field(default=1.8, gt=0.0)
     """Distance from the trunk's axis at which undocking ends."""
-    aircraft_radius_m: float = Field(0.35, gt=0.0)
-    safety_radius_m: float = Field(0.80, gt=0.0)
-    preflight_wait_s: float = Field(30.0, gt=0.0)
-    arm_wait_s: float = Field(20.0, gt=0.0)
-    takeoff_wait_s: float = Field(30.0, gt=0.0)
-    nonce_valid_s: float = Field(10.0, gt=0.0)
+    aircraft_radius_m: float = Field(default=0.35, gt=0.0)
+    safety_radius_m: float = Field(default=0.80, gt=0.0)
+    preflight_wait_s: float = Field(default=30.0, gt=0.0)
+    arm_wait_s: float = Field(default=20.0, gt=0.0)
+    takeoff_wait_s: float = Field(default=30.0, gt=0.0)
+    nonce_valid_s: float = Field(default=10.0, gt=0.0)
     ground_required: bool = False
     """Refuse to start without a ground station; a lost one is acted upon either way once it was there."""

@@ -61,14 +61,16 @@ class DockMonitor:
     def verdict(self) -> DockVerdict:
         """Judge the window."""
         if len(self._samples) < _MIN_SAMPLES:
-            return DockVerdict(False, f"{len(self._samples)} frames with the target measured")
+            return DockVerdict(docked=False, reason=f"{len(self._samples)} frames with the target measured")
         t = np.array([s.stamp_ns - self._samples[0].stamp_ns for s in self._samples]) / 1e9
         distance = float(np.mean([s.distance_m for s in self._samples]))
         bearing = float(np.mean([s.bearing_rad for s in self._samples]))
         positions = np.array([s.position_m for s in self._samples])
         reason = self._fault(t, distance, bearing, positions)
         text = f"{distance:.3f} m, {np.degrees(bearing):+.1f} deg"
-        return DockVerdict(not reason, f"{text}: {reason}" if reason else text, distance, bearing)
+        return DockVerdict(
+            docked=not reason, reason=f"{text}: {reason}" if reason else text, distance_m=distance, bearing_rad=bearing
+        )
 
     def _fault(self, t: Matrix, distance_m: float, bearing_rad: float, positions_m: Matrix) -> str:
         c = self.config

@@ -20,8 +20,8 @@ from services.navigator.config import NavigatorConfig
 from services.navigator.failsafe import AIRBORNE, Fault, Watch
 from services.navigator.preflight import missing
 from services.navigator.states import STATES
-from services.navigator.trajectory import Fence
 from services.navigator.track import Step
+from services.navigator.trajectory import Fence
 
 _RESUME: dict[MissionStateName, MissionStateName] = {"approach": "face", "dock": "approach"}
 """Where a hold resumes when not in the state it interrupted: the target is looked for again."""
@@ -66,16 +66,16 @@ class Mission:
         if name == "start":
             return self._start(now_ns)
         if self.state not in AIRBORNE | {"preflight"}:
-            return Verdict(False, f"nothing to {name}: the mission is {self.state}")
+            return _no(f"nothing to {name}: the mission is {self.state}")
         if name in ("abort", "land"):
             return self._come_down(name, now_ns)
         if name == "hold":
             if self.state == "preflight":
-                return Verdict(False, "still on the ground: abort instead")
+                return _no("still on the ground: abort instead")
             self._hold(
                 Fault("", "hold", "the operator said hold", self.config.failsafe.operator_hold_s), "operator", now_ns
             )
-            return Verdict(True, "holding")
+            return _yes("holding")
         if name == "resume":
             return self._order_resume(now_ns)
         if name == "choose":
@@ -85,12 +85,12 @@ class Mission:
     def _start(self, now_ns: int) -> Verdict:
         v = self.board.vehicle
         if self.state not in _GROUNDED:
-            return Verdict(False, f"a mission is under way: {self.state}")
+            return _no(f"a mission is under way: {self.state}")
         if not self.config.handheld:
             if v is None:
-                return Verdict(False, "no word from the autopilot: is the bridge running and the vehicle connected?")
+                return _no("no word from the autopilot: is the bridge running and the vehicle connected?")
             if v.armed:
-                return Verdict(False, "the vehicle is armed: a mission starts from the ground, disarmed")
+                return _no("the vehicle is armed: a mission starts from the ground, disarmed")
         engaged = v.engaged_mission_id if v is not None else 0
         self.mission_id = max(self.mission_id, engaged) + 1
         board, self.board = self.board, Board(self.config)
@@ -99,30 +99,30 @@ class Mission:
         self.watch.begin(self.mission_id)
         self._hold_cause = "fault"
         self._go(Next("preflight", f"mission {self.mission_id} ordered"), now_ns)
-        return Verdict(True, self.reason)
+        return _yes(self.reason)
 
     def _come_down(self, name: str, now_ns: int) -> Verdict:
         if self.state == "preflight" or (self.state == "take_off" and not self.watch.armed):
             self._go(Next("landed", f"{name} ordered before take-off"), now_ns)
         else:
             self._go(Next("landing", f"{name} ordered"), now_ns)
-        return Verdict(True, self.reason)
+        return _yes(self.reason)
 
     def _order_resume(self, now_ns: int) -> Verdict:
         if self.state != "hold":
-            return Verdict(False, f"nothing to resume: the mission is {self.state}")
+            return _no(f"nothing to resume: the mission is {self.state}")
         if self.fault is not None:
-            return Verdict(False, f"cannot resume yet: {self.fault.word}")
+            return _no(f"cannot resume yet: {self.fault.word}")
         self._leave_hold("the operator said resume", now_ns)
-        return Verdict(True, self.reason)
+        return _yes(self.reason)
 
     def _order_choose(self, tree_id: int | None, now_ns: int) -> Verdict:
         tree = next((t for t in self.board.trees if t.id == tree_id), None)
         if tree is None:
             known = ", ".join(str(t.id) for t in self.board.trees) or "none"
-            return Verdict(False, f"no tree {tree_id} in the list (known: {known})")
+            return _no(f"no tree {tree_id} in the list (known: {known})")
         if not tree.suitable:
-            return Verdict(False, f"tree {tree_id} is not suitable")
+            return _no(f"tree {tree_id} is not suitable")
         if tree.id in self.board.visited_ids:
             self.board.trees_wanted += 1
         self.board.wanted_id = tree.id
@@ -132,11 +132,11 @@ class Mission:
         elif self.state in ("dock", "docked"):
             self.board.trees_wanted = max(self.board.trees_wanted, self.board.docked_count + 1)
             self._go(Next("undock", f"the operator chose tree {tree_id}"), now_ns)
-        return Verdict(True, f"tree {tree_id} is next")
+        return _yes(f"tree {tree_id} is next")
 
     def _order_next(self, now_ns: int) -> Verdict:
         if self.state not in ("face", "approach", "dock", "docked"):
-            return Verdict(False, f"no target to leave: the mission is {self.state}")
+            return _no(f"no target to leave: the mission is {self.state}")
         if self.state != "docked":
             self.board.finish_target(visited=False)
         self.board.trees_wanted = max(self.board.trees_wanted, self.board.docked_count + 1)
@@ -145,7 +145,7 @@ class Mission:
         else:
             self.board.drop_target()
             self._go(Next("select", "the operator said next"), now_ns)
-        return Verdict(True, "the next tree")
+        return _yes("the next tree")
 
     # -- the step -----------------------------------------------------------------------------------------------
     def step(self, inputs: Inputs) -> Outputs:
@@ -165,7 +165,7 @@ class Mission:
         return Outputs(self._guidance(intent, inputs.now_ns), self._report(inputs.now_ns), events)
 
     def _adopt(self, now_ns: int) -> None:
-        """A navigator started while the aircraft flies under our setpoints holds, and then lands."""
+        """Take over an aircraft that flies under our setpoints when we were started: hold, then land."""
         v = self.board.vehicle
         if self.state != "idle" or self.mission_id or v is None or self.config.handheld:
             return
@@ -234,8 +234,7 @@ class Mission:
             if self.state in ("idle", "landed", "failed", "released"):
                 return Intent("stop", "follow", engage=False)
             if self.state == "preflight":
-                self._preflight(now_ns)
-                if self.state == "preflight":
+                if not self._preflight(now_ns):
                     return Intent("stop", "follow", engage=False)
                 continue
             if self.state == "landing":
@@ -249,13 +248,17 @@ class Mission:
             self._go(result, now_ns)
         return Intent("stop")
 
-    def _preflight(self, now_ns: int) -> None:
+    def _preflight(self, now_ns: int) -> bool:
+        """Return whether the state changed."""
         faults = missing(self.board, self.config)
         if not faults:
             self._prepare_flight()
             self._go(Next("take_off", "preflight passed"), now_ns)
         elif self._held_s(now_ns) > self.config.preflight_wait_s:
             self._go(Next("failed", f"preflight: {'; '.join(faults)}"), now_ns)
+        else:
+            return False
+        return True
 
     def _prepare_flight(self) -> None:
         here, m = self.board.here, self.config.motion
@@ -331,3 +334,11 @@ class Mission:
 
 def _vec(v: Matrix) -> tuple[float, float, float]:
     return float(v[0]), float(v[1]), float(v[2])
+
+
+def _yes(reason: str) -> Verdict:
+    return Verdict(accepted=True, reason=reason)
+
+
+def _no(reason: str) -> Verdict:
+    return Verdict(accepted=False, reason=reason)

@@ -128,8 +128,8 @@ class PoseTrack:
             self._window.clear()
         if step in (Step.FIRST, Step.RELOCATED, Step.JUMP):
             self.velocity_m_s, self.turn_rad_s = np.zeros(3), np.zeros(3)
-        elif self.correction is not None:
-            self.velocity_m_s = self.correction.vector(self.velocity_m_s)
+        elif step is Step.CORRECTION:
+            self._turn_velocity()
         self._window.append(sample)
         self.latest, self.lost = sample, False
         self._estimate()
@@ -168,6 +168,10 @@ class PoseTrack:
         ) or turn > self.limits.jump_rad + self.limits.turn_rad_s * max(dt - 0.1, 0.0):
             return Step.JUMP
         return Step.SMOOTH
+
+    def _turn_velocity(self) -> None:
+        if self.correction is not None:
+            self.velocity_m_s = self.correction.vector(self.velocity_m_s)
 
     def _estimate(self) -> None:
         newest = self._window[-1].stamp_ns

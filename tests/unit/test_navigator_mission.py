@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from services.navigator.config import NavigatorConfig
 from tests.unit.navigator_world import World, tree

@@ -1,0 +1,217 @@
+"""The wire to the autopilot: UDP, TCP or serial; a reading thread that answers TIMESYNC at once.
+
+``Link`` is what the service needs of it, so that a simulated autopilot in the same process can take its place.
+"""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from pymavlink.dialects.v20 import common as mav
+
+from services.common.errors import InputError
+from services.navigator.autopilot.bridge import timesync_answer
+
+LOG = logging.getLogger(__name__)
+
+_WAIT_S = 0.2
+_MAX_QUEUE = 4_000
+_FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
+
+
+class Link(Protocol):
+    """MAVLink messages out and in."""
+
+    def poll(self) -> list[tuple[Any, int]]:
+        """Return the messages that came since the last call with their time of arrival, nanoseconds."""
+        ...
+
+    def send(self, message: Any) -> None:  # noqa: ANN401
+        """Send a message, or drop it when there is nobody to send to."""
+        ...
+
+    def identify(self, system: int) -> None:
+        """Speak as a component of this system from now on."""
+        ...
+
+
+class Wire(Protocol):
+    """Bytes out and in; ``read`` waits a short while and may return nothing."""
+
+    def read(self) -> bytes: ...  # noqa: D102
+    def write(self, data: bytes) -> None: ...  # noqa: D102
+    def close(self) -> None: ...  # noqa: D102
+
+
+class UdpWire:
+    """A datagram socket that listens and answers who spoke last, or speaks to a fixed address."""
+
+    def __init__(self, host: str, port: int, *, listen: bool) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.settimeout(_WAIT_S)
+        self._peer: tuple[str, int] | None = None if listen else (host, port)
+        if listen:
+            self._socket.bind((host, port))
+
+    def read(self) -> bytes:
+        """Return the next datagram, empty after a short wait."""
+        try:
+            data, sender = self._socket.recvfrom(65535)
+        except (TimeoutError, ConnectionRefusedError):
+            return b""
+        self._peer = sender
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send a datagram to the peer, if there is one."""
+        if self._peer is not None:
+            self._socket.sendto(data, self._peer)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+class TcpWire:
+    """A TCP client; a lost connection raises OSError."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self._socket = socket.create_connection((host, port), timeout=5.0)
+        self._socket.settimeout(_WAIT_S)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def read(self) -> bytes:
+        """Return what came, empty after a short wait."""
+        try:
+            data = self._socket.recv(65535)
+        except TimeoutError:
+            return b""
+        if not data:
+            raise ConnectionResetError("the autopilot closed the connection")
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send all of it."""
+        self._socket.sendall(data)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+class SerialWire:
+    """A serial port, through pyserial."""
+
+    def __init__(self, device: str, baud: int) -> None:
+        try:
+            import serial
+        except ImportError as error:
+            raise InputError(f"serial:{device}: the package pyserial is missing: pip install pyserial") from error
+        self._port = serial.Serial(device, baud, timeout=_WAIT_S, write_timeout=_WAIT_S)
+
+    def read(self) -> bytes:
+        """Return what came, empty after a short wait."""
+        return bytes(self._port.read(max(1, self._port.in_waiting)))
+
+    def write(self, data: bytes) -> None:
+        """Send all of it."""
+        self._port.write(data)
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()
+
+
+def open_wire(connection: str) -> Wire:
+    """Open the wire that ``connection`` names.
+
+    Raises:
+        InputError: a form that is not known, an address in use, a device that is not there.
+    """
+    kind, _, rest = connection.partition(":")
+    place, _, number = rest.rpartition(":")
+    if kind not in ("udpin", "udpout", "tcp", "serial") or not place or not number.isdigit():
+        raise InputError(f"autopilot.connection {connection!r}: expected {_FORMS}")
+    try:
+        if kind == "serial":
+            return SerialWire(place, int(number))
+        if kind == "tcp":
+            return TcpWire(place, int(number))
+        return UdpWire(place, int(number), listen=kind == "udpin")
+    except (OSError, OverflowError) as error:
+        raise InputError(f"autopilot.connection {connection!r}: {error}") from error
+
+
+class MavlinkLink:
+    """A wire with MAVLink 2 on it. Its thread parses what comes and answers TIMESYNC at once."""
+
+    def __init__(self, wire: Wire, component: int, system: int, now_ns: Callable[[], int]) -> None:
+        self._wire = wire
+        self._now_ns = now_ns
+        self._mav = mav.MAVLink(None, srcSystem=system, srcComponent=component)
+        self._mav.robust_parsing = True
+        self._lock = threading.Lock()
+        self._queue: deque[tuple[Any, int]] = deque(maxlen=_MAX_QUEUE)
+        self._stopped = threading.Event()
+        self.failed = ""
+        """Why the wire is dead; empty while it lives."""
+        self.bad_bytes = 0
+        self._thread = threading.Thread(target=self._read, name="mavlink", daemon=True)
+        self._thread.start()
+
+    def poll(self) -> list[tuple[Any, int]]:
+        """Return what came since the last call."""
+        out = []
+        while self._queue:
+            out.append(self._queue.popleft())
+        return out
+
+    def send(self, message: Any) -> None:  # noqa: ANN401
+        """Send a message; a wire that fails is told by ``failed``."""
+        with self._lock:
+            data = message.pack(self._mav)
+            self._mav.seq = (self._mav.seq + 1) % 256
+        try:
+            self._wire.write(data)
+        except OSError as error:
+            self.failed = str(error)
+
+    def identify(self, system: int) -> None:
+        """Speak as a component of this system from now on."""
+        self._mav.srcSystem = system
+
+    def close(self) -> None:
+        """Stop the thread and close the wire."""
+        self._stopped.set()
+        self._thread.join(2.0 * _WAIT_S)
+        self._wire.close()
+
+    def _read(self) -> None:
+        while not self._stopped.is_set():
+            try:
+                data = self._wire.read()
+            except OSError as error:
+                self.failed = str(error)
+                if self._stopped.wait(_WAIT_S):
+                    return
+                continue
+            if data:
+                self._take(data)
+
+    def _take(self, data: bytes) -> None:
+        received_ns = self._now_ns()
+        for message in self._mav.parse_buffer(data) or ():
+            kind = message.get_type()
+            if kind == "BAD_DATA":
+                self.bad_bytes += 1
+            elif kind == "TIMESYNC":
+                answer = timesync_answer(message, self._now_ns())
+                if answer is not None:
+                    self.send(answer)
+            else:
+                self._queue.append((message, received_ns))

@@ -1,0 +1,72 @@
+"""The autopilot process: the bridge on the bus on one side, on the wire on the other."""
+
+from __future__ import annotations
+
+import atexit
+
+from schemas.navigation import Guidance
+from schemas.slam import Pose
+from schemas.topics import MISSION_GUIDANCE, SLAM_POSE, VEHICLE_STATE
+from services.common.context import Context
+from services.navigator.autopilot.bridge import Bridge
+from services.navigator.autopilot.config import AutopilotConfig
+from services.navigator.autopilot.link import Link, MavlinkLink, open_wire
+
+
+class Autopilot:
+    """Drives a bridge over a link."""
+
+    def __init__(self, context: Context, config: AutopilotConfig, link: Link) -> None:
+        self._context = context
+        self._link = link
+        self.bridge = Bridge(config)
+        self._identified = False
+
+    def register(self) -> None:
+        """Connect to the bus."""
+        c, config = self._context, self.bridge.config
+        c.on(SLAM_POSE, self._on_pose)
+        c.on(MISSION_GUIDANCE, self._on_guidance)
+        c.every(config.poll_s, self.tick)
+        c.every(1.0 / config.state_hz, self._publish_state)
+
+    def tick(self) -> None:
+        """Take what came from the autopilot and send what is due."""
+        for message, received_ns in self._link.poll():
+            self.bridge.handle(message, received_ns)
+        if not self._identified and self.bridge.telemetry.system is not None:
+            self._link.identify(self.bridge.telemetry.system)
+            self._identified = True
+        self._send()
+
+    def _send(self) -> None:
+        for message in self.bridge.tick(self._context.clock.now_ns()):
+            self._link.send(message)
+
+    def _on_pose(self, pose: Pose) -> None:
+        self.bridge.on_pose(pose, self._context.clock.now_ns())
+        self._send()
+
+    def _on_guidance(self, guidance: Guidance) -> None:
+        self.bridge.on_guidance(guidance, self._context.clock.now_ns())
+
+    def _publish_state(self) -> None:
+        now_ns = self._context.clock.now_ns()
+        state = self.bridge.state(now_ns)
+        self._context.publish(VEHICLE_STATE, state)
+        book = self._context.health
+        book.counters["odometry_sent"] = self.bridge.vision.sent
+        book.counters["setpoints_sent"] = self.bridge.setpoints_sent
+        book.note("link", "" if state.connected else "no word from the autopilot: is it running, is the address right?")
+        book.note("wire", getattr(self._link, "failed", ""))
+
+
+def build(context: Context) -> None:
+    """Start the bridge on a context, over the wire that the configuration names."""
+    config: AutopilotConfig = getattr(context.config, "autopilot", None) or AutopilotConfig()
+    link = MavlinkLink(open_wire(config.connection), config.component_id, config.system_id, context.clock.now_ns)
+    atexit.register(link.close)
+    on_stop = getattr(context, "on_stop", None)
+    if on_stop is not None:
+        on_stop(link.close)
+    Autopilot(context, config, link).register()
