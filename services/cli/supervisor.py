@@ -127,6 +127,7 @@ class Supervisor:
         child.process = None
         child.last_fault = _words(code)
         child.deaths_in_a_row += 0 if child.ready else 1
+        child.ready = False
         child.restarts += 1
         if code == _EXIT_INPUT or child.deaths_in_a_row >= self.limits.give_up_after:
             self.given_up = child

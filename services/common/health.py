@@ -12,6 +12,7 @@ from typing import Literal, TypeVar
 
 from schemas.envelope import MAX_TEXT
 from schemas.health import Health
+from schemas.topics import HEALTH
 from services.common.context import HealthBook
 
 State = Literal["starting", "ready", "degraded", "stopping"]
@@ -46,6 +47,7 @@ class HealthReporter:
         now_s = time.monotonic()
         elapsed_s = max(now_s - self._since_s, 1e-3)
         rates = {name: (count - self._passed.get(name, 0)) / elapsed_s for name, count in passed.items()}
+        rates.pop(HEALTH.name, None)
         self._since_s, self._passed = now_s, dict(passed)
         notes = [f"{about}: {text}" for about, text in sorted(self._book.notes.items())]
         health = Health(

@@ -1,0 +1,135 @@
+"""The supervisor's decisions, without processes."""
+
+from __future__ import annotations
+
+import itertools
+import signal
+import subprocess
+from dataclasses import dataclass, field
+
+from services.cli.run_config import SupervisorConfig
+from services.cli.supervisor import Supervisor
+
+LIMITS = SupervisorConfig(hung_after_s=5.0, start_within_s=60.0, backoff_s=0.5, backoff_max_s=3.0, give_up_after=4)
+
+
+@dataclass
+class FakeProcess:
+    pid: int
+    code: int | None = None
+    stubborn: bool = False
+    signals: list[int] = field(default_factory=list)
+
+    def poll(self) -> int | None:
+        return self.code
+
+    def send_signal(self, sig: int) -> None:
+        self.signals.append(sig)
+        if sig == signal.SIGKILL or not self.stubborn:
+            self.code = -sig
+
+    def wait(self, timeout: float | None = None) -> int:
+        if self.code is None:
+            raise subprocess.TimeoutExpired("fake", timeout or 0.0)
+        return self.code
+
+
+class Bench:
+    def __init__(self, *names: str) -> None:
+        self.now_s = 100.0
+        self.spawned: list[FakeProcess] = []
+        self.order: list[str] = []
+        self.supervisor = Supervisor(names, self.spawn, LIMITS, now_s=lambda: self.now_s)
+
+    def spawn(self, name: str) -> FakeProcess:
+        self.order.append(name)
+        self.spawned.append(FakeProcess(1000 + len(self.spawned)))
+        return self.spawned[-1]
+
+    def after(self, seconds: float) -> None:
+        self.now_s += seconds
+        self.supervisor.check()
+
+    def ready(self, name: str) -> None:
+        process = self.supervisor.children[name].process
+        assert process is not None
+        self.supervisor.heard(name, process.pid, "ready")
+
+
+def test_all_start_in_order_and_are_ready_when_all_said_so() -> None:
+    bench = Bench("router", "camera")
+    bench.after(0.0)
+    assert bench.order == ["router", "camera"]
+    bench.ready("router")
+    assert not bench.supervisor.all_ready
+    bench.ready("camera")
+    assert bench.supervisor.all_ready
+
+
+def test_a_dead_service_comes_back_after_the_pause() -> None:
+    bench = Bench("slam")
+    bench.after(0.0)
+    bench.ready("slam")
+    bench.spawned[0].code = 1
+    bench.after(0.1)
+    assert len(bench.spawned) == 1
+    bench.after(0.4)
+    assert len(bench.spawned) == 1
+    bench.after(0.2)
+    assert len(bench.spawned) == 2
+    assert bench.supervisor.restarts == 1
+
+
+def test_the_pause_doubles_for_early_deaths_and_ends_in_giving_up() -> None:
+    bench = Bench("slam")
+    starts_s = []
+    for _ in range(200):
+        bench.after(0.1)
+        if bench.spawned and bench.spawned[-1].code is None:
+            starts_s.append(bench.now_s)
+            bench.spawned[-1].code = 1
+        if bench.supervisor.given_up:
+            break
+    pauses = [round(b - a, 1) for a, b in itertools.pairwise(starts_s)]
+    assert pauses == sorted(pauses)
+    assert pauses[0] < 1.0 < pauses[-1]
+    assert bench.supervisor.given_up is bench.supervisor.children["slam"]
+    assert len(starts_s) == LIMITS.give_up_after
+
+
+def test_a_silent_service_is_killed_but_one_that_still_starts_is_not() -> None:
+    bench = Bench("slam", "mapper")
+    bench.after(0.0)
+    bench.ready("slam")
+    bench.after(6.0)
+    assert bench.spawned[0].signals == [signal.SIGKILL]
+    assert bench.spawned[1].signals == []
+    bench.after(55.0)
+    assert bench.spawned[1].signals == [signal.SIGKILL]
+
+
+def test_health_of_a_replaced_process_counts_for_nothing() -> None:
+    bench = Bench("slam")
+    bench.after(0.0)
+    bench.supervisor.heard("slam", 1, "ready")
+    bench.supervisor.heard("unknown", 1, "ready")
+    assert not bench.supervisor.all_ready
+
+
+def test_bad_input_is_not_tried_again() -> None:
+    bench = Bench("camera")
+    bench.after(0.0)
+    bench.spawned[0].code = 2
+    bench.after(0.1)
+    assert bench.supervisor.given_up is bench.supervisor.children["camera"]
+
+
+def test_stop_asks_first_and_kills_then_and_the_router_goes_last() -> None:
+    bench = Bench("router", "camera", "slam")
+    bench.after(0.0)
+    bench.spawned[2].stubborn = True
+    bench.supervisor.stop_all()
+    router, camera, slam = bench.spawned
+    assert camera.signals == [signal.SIGTERM]
+    assert slam.signals == [signal.SIGTERM, signal.SIGKILL]
+    assert router.signals == [signal.SIGTERM]
