@@ -111,11 +111,11 @@ class Chain:
         """Let the chain come to rest and collect the final estimates; a service left out contributes nothing."""
         self._hub.advance_to(self._hub.clock.now_ns() + round(SETTLE_S * 1e9))
         slam, mapper, detector = (self._services.get(name) for name in ("slam", "mapper", "detector"))
-        started = slam is not None and slam.slam is not None
+        core = None if slam is None else slam.slam
         cloud = None if mapper is None else mapper.cloud()
         return OfflineResult(
             counts=self.counts,
-            trajectory=list(slam.slam.final_trajectory()) if started else [],
+            trajectory=[] if core is None else list(core.final_trajectory()),
             online=self._online,
             points_m=_NO_POINTS if cloud is None else cloud.points_m,
             rgb=_NO_COLOURS if cloud is None else cloud.rgb,
