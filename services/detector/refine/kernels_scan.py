@@ -41,7 +41,7 @@ def scan_rows(
             x, y = ray_x[v, u], ray_y[v, u]
             if not _inside(z, x, y, M, up_row, camera_z_m, limits):
                 continue
-            if start >= 0 and (u - last > _MAX_GAP_PX or abs(z - last_z) > jump_m(last_z, noise) * (u - last)):
+            if start >= 0 and (u - last > _MAX_GAP_PX or abs(z - last_z) > jump_m(last_z, u - last, noise)):
                 count = _close(depth, ray_x, ray_y, M, v, start, last, limits, noise, runs, count)
                 start = -1
             if start < 0:
@@ -53,10 +53,13 @@ def scan_rows(
 
 
 @njit(cache=True, nogil=True)
-def jump_m(z: float, noise: Matrix) -> float:
-    """Return the step of depth between neighbours that parts two surfaces: noise, and a cylinder's own slope."""
+def jump_m(z: float, apart_px: int, noise: Matrix) -> float:
+    """Return the step of depth that parts two surfaces: more than noise and a cylinder's own slope.
+
+    The last ``k`` pixels before the tangent of a cylinder of radius r rise by ``sqrt(2 r k z / f)``; r is 10 cm here.
+    """
     sigma = noise[0] * z * z + noise[1]
-    return 4.0 * sigma + math.sqrt(0.2 * z * noise[2])
+    return 3.5 * sigma + math.sqrt(0.2 * z * noise[2] * apart_px)
 
 
 @njit(cache=True, nogil=True)
@@ -92,9 +95,9 @@ def _beside(depth: Depth, v: int, u: int, step: int, noise: Matrix) -> float:
         other = depth[v, w]
         if not other > 0.0:
             continue
-        if other > z + jump_m(z, noise):
+        if other > z + jump_m(z, k, noise):
             return SILHOUETTE
-        if other < z - jump_m(z, noise):
+        if other < z - jump_m(z, k, noise):
             return OCCLUDED
         if k > _MAX_GAP_PX:
             return JOINED
