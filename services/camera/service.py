@@ -56,7 +56,7 @@ class CameraService:
         """Send a frame; also compressed when somebody listens to that."""
         health = self.context.health
         self.context.publish(CAMERA_RGBD, frame)
-        if _has_listeners(self.context):
+        if self.context.listened(CAMERA_COMPRESSED):
             with health.timed("compress"):
                 colour: ColourEncoding = "none" if frame.colour_encoding == "none" else "jpeg"
                 packed = recode(frame, colour, self._config.compressed_depth, self._config.jpeg_quality)
@@ -119,9 +119,3 @@ class Replay:
         """Return when a frame is due on our clock: recorded intervals, divided by the rate."""
         assert self._first_ns is not None
         return self._begun_ns + round((stamp_ns - self._first_ns) / self._config.rate)
-
-
-def _has_listeners(context: Context) -> bool:
-    """Whether somebody wants compressed frames; a bus that cannot tell is taken to have nobody."""
-    ask = getattr(context, "listened", None)
-    return bool(ask(CAMERA_COMPRESSED)) if callable(ask) else False
