@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 _EXIT_INTERRUPTED = 130
 _ROUTER_WITHIN_S = 20.0
 _LOOK_S = 0.2
+_SOURCES = frozenset({"camera", "simulator"})
 
 
 def run(
@@ -123,7 +124,7 @@ class Run:
         set_up("run", "warning" if self._console.is_terminal else self._tree.log_level)
         stop = StopSignal()
         stop.install(force=False)
-        supervisor = Supervisor(services_for(self._tree), self._spawn, self._tree.supervisor)
+        supervisor = Supervisor(services_for(self._tree), self._spawn, self._tree.supervisor, last=_SOURCES)
         try:
             return self._supervised(supervisor, stop)
         finally:
@@ -213,7 +214,8 @@ class Run:
             typer.echo(json.dumps(values))
             return
         console = Console()
-        console.print(tree_table(watch.trees, watch.truth))
+        if values["trees"] or watch.truth is not None:
+            console.print(tree_table(watch.trees, watch.truth))
         console.print(f"treedock: {closing_line(values)}", highlight=False, soft_wrap=True)
 
 

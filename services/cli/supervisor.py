@@ -67,6 +67,8 @@ class Supervisor:
     names: Iterable[str]
     spawn: Callable[[str], Process]
     limits: SupervisorConfig
+    last: frozenset[str] = frozenset()
+    """Services that begin only when all others are ready: a source whose first frames nobody would see."""
     now_s: Callable[[], float] = time.monotonic
     children: dict[str, Child] = field(init=False)
     given_up: Child | None = None
@@ -99,7 +101,7 @@ class Supervisor:
         """Start what is due, notice the dead, kill the hung. Called several times a second."""
         for child in self.children.values():
             if child.process is None:
-                if self.now_s() >= child.start_at_s:
+                if self.now_s() >= child.start_at_s and not self._held_back(child):
                     self._start(child)
                 continue
             code = child.process.poll()
@@ -109,6 +111,15 @@ class Supervisor:
                 LOG.warning("%s (pid %d) %s: it is killed and started again", child.name, child.process.pid, reason)
                 child.last_fault = reason
                 child.process.send_signal(signal.SIGKILL)
+
+    def _held_back(self, child: Child) -> bool:
+        """Whether the first start waits for other services."""
+        first = child.restarts == 0
+        return (
+            first
+            and child.name in self.last
+            and not all(other.ready for other in self.children.values() if other.name not in self.last)
+        )
 
     def _start(self, child: Child) -> None:
         child.process = self.spawn(child.name)

@@ -17,9 +17,13 @@ from schemas.trees import TreeList
 from services.common.bus import Bus
 from services.common.context import HealthBook
 
-_QUIET_REPORTS = 2
-_DRAINED_INPUTS = {"slam": "camera/rgbd", "mapper": "slam/keyframe", "detector": "map/cloud"}
-"""The input that must have fallen quiet before a service has nothing under way."""
+_QUIET_REPORTS = 3
+_CHAIN = {
+    "slam": ("camera/rgbd", ("slam/keyframe", "slam/graph")),
+    "mapper": ("slam/keyframe", ("map/cloud",)),
+    "detector": ("map/cloud", ("trees/list",)),
+}
+"""What must have fallen quiet before nothing is under way any more: input and outputs of each, upstream first."""
 
 
 @dataclass
@@ -73,8 +77,8 @@ class Watch:
 
     @property
     def drained(self) -> bool:
-        """Whether slam, mapper and detector have worked off their inputs: two reports in a row without any."""
-        return all(self._quiet.get(name, 0) >= _QUIET_REPORTS for name in _DRAINED_INPUTS if name in self.health)
+        """Whether slam, mapper and detector are through: three reports in a row (a hung one sends none) without work."""
+        return all(self._quiet.get(name, 0) >= _QUIET_REPORTS for name in _CHAIN if name in self.health)
 
     def dropped(self) -> dict[str, int]:
         """Return the dropped samples per service, where there are any."""
@@ -85,20 +89,22 @@ class Watch:
         return {name: count for name, count in sorted(sums.items()) if count}
 
     def _on_health(self, message: Health) -> None:
-        name = message.service
-        before = self.health.get(name)
-        self.health[name] = message
-        topic = _DRAINED_INPUTS.get(name)
-        if topic is not None:
-            busy = message.rates_hz.get(topic, 0.0) > 0.0 or (
-                name == "detector" and self._trees_changed(before, message)
-            )
-            self._quiet[name] = 0 if busy or not self.source_ended else self._quiet.get(name, 0) + 1
+        self.health[message.service] = message
+        if message.service in _CHAIN:
+            self._note_work(message)
         self.on_health(message)
 
-    @staticmethod
-    def _trees_changed(before: Health | None, now: Health) -> bool:
-        return before is None or now.rates_hz.get("trees/list", 0.0) > 0.0
+    def _note_work(self, message: Health) -> None:
+        """Count reports without input; output makes everything behind it busy again."""
+        topic_in, topics_out = _CHAIN[message.service]
+        received = message.rates_hz.get(topic_in, 0.0) > 0.0
+        sent = any(message.rates_hz.get(topic, 0.0) > 0.0 for topic in topics_out)
+        idle = self.source_ended and not received and not sent
+        self._quiet[message.service] = self._quiet.get(message.service, 0) + 1 if idle else 0
+        if sent:
+            names = list(_CHAIN)
+            for later in names[names.index(message.service) + 1 :]:
+                self._quiet[later] = 0
 
     def _on_trees(self, message: TreeList) -> None:
         self.trees = message

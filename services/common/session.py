@@ -19,7 +19,8 @@ from services.common.errors import InputError
 LOG = logging.getLogger(__name__)
 
 _CLOSE_TIMEOUT_S = 0.5
-_RETRY_S = 0.25
+_RETRY_S = 0.1
+_TELL_AFTER_S = 2.0
 _ENOUGH_LOCKED_BYTES = 64 * 1024 * 1024
 
 
@@ -81,7 +82,7 @@ def opened_client(endpoint: str, stopped: Callable[[], bool], wait_s: float = fl
     while not _reachable(endpoint):
         if stopped() or time.monotonic() - begin > wait_s:
             raise InputError(f"no router answers at {endpoint}: start `treedock run` or `treedock router`")
-        if not told:
+        if not told and time.monotonic() - begin > _TELL_AFTER_S:
             LOG.warning("waiting for a router at %s", endpoint)
             told = True
         time.sleep(_RETRY_S)

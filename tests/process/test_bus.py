@@ -132,7 +132,7 @@ def test_sigterm_ends_a_service_whose_handler_hangs(routed: System) -> None:
 
 def test_sigterm_ends_a_service_that_waits_for_its_router(system: System) -> None:
     camera = system.start("camera")
-    assert until(lambda: system.log("camera").exists() and "waiting for a router" in system.said("camera"))
+    assert until(lambda: system.log("camera").exists() and "waiting for a router" in system.said("camera")), "told"
     assert stop_time_s(camera) < 1.0
     assert camera.returncode == 0
 

@@ -35,11 +35,11 @@ class FakeProcess:
 
 
 class Bench:
-    def __init__(self, *names: str) -> None:
+    def __init__(self, *names: str, last: tuple[str, ...] = ()) -> None:
         self.now_s = 100.0
         self.spawned: list[FakeProcess] = []
         self.order: list[str] = []
-        self.supervisor = Supervisor(names, self.spawn, LIMITS, now_s=lambda: self.now_s)
+        self.supervisor = Supervisor(names, self.spawn, LIMITS, frozenset(last), lambda: self.now_s)
 
     def spawn(self, name: str) -> FakeProcess:
         self.order.append(name)
@@ -133,3 +133,20 @@ def test_stop_asks_first_and_kills_then_and_the_router_goes_last() -> None:
     assert camera.signals == [signal.SIGTERM]
     assert slam.signals == [signal.SIGTERM, signal.SIGKILL]
     assert router.signals == [signal.SIGTERM]
+
+
+def test_the_source_begins_when_all_others_are_ready_but_comes_back_at_once() -> None:
+    bench = Bench("router", "camera", "slam", last=("camera",))
+    bench.after(0.0)
+    assert bench.order == ["router", "slam"]
+    bench.ready("router")
+    bench.after(1.0)
+    assert bench.order == ["router", "slam"]
+    bench.ready("slam")
+    bench.after(1.0)
+    assert bench.order == ["router", "slam", "camera"]
+    bench.spawned[1].code = 1
+    bench.spawned[2].code = 1
+    bench.after(0.1)
+    bench.after(5.0)
+    assert sorted(bench.order[3:]) == ["camera", "slam"]
