@@ -203,8 +203,8 @@ def person(thing: Person, ground: Ground) -> Mesh:
 
 
 def terrain(ground: Ground, reach_m: float) -> Mesh:
-    """Return the ground as a grid that is fine (0.1 m) near the origin and widens outward."""
-    fine = np.arange(0.0, 7.0, 0.1)
+    """Return the ground as a grid that is fine (0.15 m) near the origin and widens outward."""
+    fine = np.arange(0.0, 7.0, 0.15)
     coarse = np.geomspace(7.0, reach_m, 40)
     half = np.concatenate([fine, coarse])
     line = np.concatenate([-half[:0:-1], half])

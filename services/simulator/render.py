@@ -64,7 +64,7 @@ class Renderer:
         return Rendering(self._colour, hits.distance)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _aim(directions: Floats32, T: Floats32, rays: Floats32) -> None:
     """Turn camera directions with z = 1 into world rays: their hit distance is the depth."""
     for v in range(directions.shape[0]):

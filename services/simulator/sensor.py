@@ -117,7 +117,7 @@ def _quantised(depth_m: Floats32, near_m: float, far_m: float) -> NDArray[np.uin
     return np.where(good, np.round(np.where(good, depth_m, 0.0) * 1000.0), 0.0).astype(np.uint16)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _stereo(
     disparity: Floats32, spread: Floats32, mixed: Floats32, noise: Floats32, holes: Floats32, scale: float,
     sigma_px: float, focal_baseline: float, near_m: float, fade_m: float, far_m: float, dropout: float,
@@ -156,7 +156,7 @@ def _stereo(
             out[v, u] = np.uint16(z * 1000.0 + 0.5)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _grain(colour: NDArray[np.uint8], noise: Floats32, gain: float, out: NDArray[np.uint8]) -> None:
     for v in range(colour.shape[0]):
         for u in range(colour.shape[1]):

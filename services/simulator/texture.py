@@ -17,17 +17,20 @@ LATTICE = 64
 """Side of the noise lattice; it repeats after that many cells."""
 _MASK = LATTICE - 1
 
+_FAST = {"contract", "arcp", "nsz"}
+"""Floating point freedoms that keep infinities and the order of sums."""
+
 Colour = tuple[float, float, float]
 
 # Per material: dark and light colour, flake colour (BGR 0..255), cell length (x, y, z) of the coarsest octave in
 # metres, flake length in metres, share of flakes.
 _ROWS: tuple[tuple[Colour, Colour, Colour, tuple[float, float, float], float, float], ...] = (
-    ((28, 42, 52), (72, 112, 124), (96, 150, 178), (0.9, 0.9, 0.9), 0.045, 0.30),  # GROUND
-    ((26, 34, 46), (92, 112, 138), (150, 164, 176), (0.16, 0.16, 0.75), 0.030, 0.22),  # BARK
-    ((22, 58, 28), (62, 142, 84), (110, 196, 150), (0.30, 0.30, 0.30), 0.035, 0.30),  # LEAF
-    ((60, 84, 108), (118, 150, 176), (48, 62, 80), (0.20, 0.20, 0.60), 0.035, 0.18),  # WOOD
-    ((24, 34, 30), (86, 118, 108), (140, 166, 160), (1.6, 1.6, 7.0), 0.45, 0.30),  # BACKDROP
-    ((80, 40, 36), (150, 96, 70), (190, 180, 200), (0.25, 0.25, 0.25), 0.040, 0.15),  # CLOTH
+    ((20, 32, 40), (74, 116, 130), (120, 178, 208), (0.7, 0.7, 0.7), 0.085, 0.45),  # GROUND
+    ((20, 28, 38), (96, 116, 142), (160, 176, 190), (0.16, 0.16, 0.75), 0.055, 0.45),  # BARK
+    ((22, 58, 28), (62, 142, 84), (110, 196, 150), (0.30, 0.30, 0.30), 0.060, 0.45),  # LEAF
+    ((60, 84, 108), (118, 150, 176), (48, 62, 80), (0.20, 0.20, 0.60), 0.060, 0.40),  # WOOD
+    ((34, 46, 42), (92, 120, 110), (118, 146, 138), (1.6, 1.6, 7.0), 1.1, 0.40),  # BACKDROP
+    ((80, 40, 36), (150, 96, 70), (190, 180, 200), (0.25, 0.25, 0.25), 0.060, 0.30),  # CLOTH
 )
 
 
@@ -42,12 +45,12 @@ def lattice(seed: int) -> NDArray[np.float32]:
     return np.random.default_rng([seed, 11]).random(LATTICE**3, dtype=np.float32)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST, inline="always")
 def _at(table: NDArray[np.float32], i: int, j: int, k: int) -> np.float32:
     return np.float32(table[((i & _MASK) * LATTICE + (j & _MASK)) * LATTICE + (k & _MASK)])
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def smooth_noise(table: NDArray[np.float32], x: np.float32, y: np.float32, z: np.float32) -> np.float32:
     """Return trilinear noise, 0..1, at lattice coordinates."""
     fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
@@ -71,7 +74,7 @@ _HALF, _ONE = np.float32(0.5), np.float32(1.0)
 _ZERO = np.float32(0.0)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def _brightness(
     table: NDArray[np.float32], row: NDArray[np.float32], x: np.float32, y: np.float32, z: np.float32,
     pixel_m: np.float32,
@@ -80,7 +83,7 @@ def _brightness(
     sx, sy, sz = x / row[9], y / row[10], z / row[11]
     cell = row[9]
     total, weight, amplitude, warp = _ZERO, _ZERO, _ONE, _HALF
-    for octave in range(4):
+    for octave in range(5):
         fade = min(_ONE, max(_ZERO, _HALF * cell / pixel_m - _HALF))
         if fade <= _ZERO:
             break
@@ -97,28 +100,33 @@ def _brightness(
     return min(_ONE, max(_ZERO, _HALF + contrast)), warp
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def _flake(
-    table: NDArray[np.float32], row: NDArray[np.float32], x: np.float32, y: np.float32, z: np.float32,
-    pixel_m: np.float32, warp: np.float32,
+    table: NDArray[np.float32], x: np.float32, y: np.float32, z: np.float32, size: np.float32, tall: np.float32,
+    share: np.float32, pixel_m: np.float32,
 ) -> np.float32:  # fmt: skip
-    """Return how much of a flake's colour a point has, 0..1."""
-    size = row[12]
-    fade = min(_ONE, max(_ZERO, size / pixel_m - np.float32(0.8)))
+    """Return how much of a flake's colour a point has, 0..1: an ellipse in some of the cells, its edge a pixel soft."""
+    fade = min(_ONE, max(_ZERO, size / pixel_m - np.float32(1.5)))
     if fade <= _ZERO:
         return _ZERO
-    shift = np.float32(1.3) * warp
-    tall = size * min(row[11] / row[9], np.float32(2.5))
-    i = int(np.floor(x / size + shift))
-    j = int(np.floor(y / size + np.float32(0.7) * x / size + shift))
-    k = int(np.floor(z / tall - shift))
+    sx, sy, sz = x / size, y / size + np.float32(0.37) * x / size, z / tall
+    fx, fy, fz = np.floor(sx), np.floor(sy), np.floor(sz)
+    i, j, k = int(fx), int(fy), int(fz)
     pick = _at(table, i, j, k)
-    if pick >= row[13]:
+    if pick >= share:
         return _ZERO
-    return np.float32(fade * (np.float32(0.35) + np.float32(0.65) * pick / row[13]))
+    turn = np.float32(2.0) * _at(table, j, k, i + 31) - _ONE
+    norm = _ONE / (_ONE + turn * turn)
+    cosine, sine = (_ONE - turn * turn) * norm, np.float32(2.0) * turn * norm
+    a, b, c = sx - fx - _HALF, sy - fy - _HALF, sz - fz - _HALF
+    along, across = cosine * a + sine * b, cosine * b - sine * a
+    radius = np.sqrt(np.float32(5.0) * along * along + np.float32(14.0) * across * across + np.float32(4.0) * c * c)
+    edge = (_ONE - radius) * size / (np.float32(3.0) * pixel_m)
+    inside = min(_ONE, max(_ZERO, edge + _HALF))
+    return np.float32(fade * inside * (np.float32(0.4) + np.float32(0.6) * pick / share))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def _sky(table: NDArray[np.float32], dx: float, dy: float, dz: float, pixel: NDArray[np.uint8]) -> None:
     up = dz / np.sqrt(dx * dx + dy * dy + dz * dz)
     x, y = 6.0 * dx / (abs(dz) + 0.3), 6.0 * dy / (abs(dz) + 0.3)
@@ -128,7 +136,7 @@ def _sky(table: NDArray[np.float32], dx: float, dy: float, dz: float, pixel: NDA
     pixel[2] = np.uint8(min(255.0, 205.0 - 85.0 * up + cloud))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 def paint(
     table: NDArray[np.float32], rows: NDArray[np.float32], material: NDArray[np.int64], rays: NDArray[np.float32],
     distance: NDArray[np.float32], part: NDArray[np.uint32], normal: NDArray[np.float32], sun: NDArray[np.float32],
@@ -147,17 +155,25 @@ def paint(
             p = int(part[v, u])
             row = rows[material[p]]
             bright, warp = _brightness(table, row, x, y, z, t * pixel_rad)
-            flake = _flake(table, row, x, y, z, t * pixel_rad, warp)
+            size, tall = row[12], row[12] * min(row[11] / row[9], np.float32(1.8))
+            bend = size * warp  # what lies on the coarser pattern follows it
+            flake = _flake(table, x + bend, y - bend, z + bend, size, tall, row[13], t * pixel_rad)
+            if flake <= _ZERO:
+                fine = np.float32(0.31)
+                flake = -_flake(table, y, x, z, fine * size, fine * tall, row[13], t * pixel_rad)
             nx, ny, nz = normal[v, u, 0], normal[v, u, 1], normal[v, u, 2]
             light = nx * sun[0] + ny * sun[1] + nz * sun[2]
             if nx * dx + ny * dy + nz * dz > _ZERO:  # the triangle's back
                 light = -light
             tint = np.float32(0.85) + np.float32(0.3) * _at(table, p, 7, 3)
             shade = tint * (np.float32(0.62) + np.float32(0.45) * max(_ZERO, light))
-            haze = min(np.float32(0.55), max(_ZERO, (t - np.float32(5.0)) / np.float32(60.0)))
+            haze = min(np.float32(0.6), max(_ZERO, (t - np.float32(5.0)) / np.float32(45.0)))
             for c in range(3):
                 base = row[c] + bright * (row[3 + c] - row[c])
-                base += flake * (row[6 + c] - base)
+                if flake >= _ZERO:
+                    base += flake * (row[6 + c] - base)
+                else:  # the fine flakes are dark
+                    base += np.float32(-0.8) * flake * (np.float32(0.5) * row[c] - base)
                 base *= shade
                 base += haze * (np.float32(195.0) - base)
                 out[v, u, c] = np.uint8(min(np.float32(255.0), max(_ZERO, base)))
