@@ -229,7 +229,7 @@ class MavlinkServer:
     def _on_timesync(self, port: Port, message: Message) -> None:
         now_s = self.vehicle.now_s
         if message.tc1 == 0:
-            port.send(m.MAVLink_timesync_message(int(now_s * 1e9), message.ts1, 0, 0))
+            port.send(m.MAVLink_timesync_message(int(now_s * 1e9), message.ts1))
         else:
             port.timesync.update(now_s, message.ts1 * 1e-9, message.tc1 * 1e-9)
 

@@ -151,7 +151,7 @@ def system_time(v: Vehicle) -> Message:
 
 def timesync(v: Vehicle) -> Message:
     """TIMESYNC request in our own clock."""
-    return m.MAVLink_timesync_message(0, int(v.now_s * 1e9), 0, 0)
+    return m.MAVLink_timesync_message(0, int(v.now_s * 1e9))
 
 
 def gps_global_origin(v: Vehicle) -> Message:

@@ -11,6 +11,7 @@ import math
 CONVERGENCE_SAMPLES = 500
 MAX_ROUND_TRIP_S = 0.010
 _MAX_DEVIATION_S = 0.1
+_CLOCK_GRAIN_S = 1e-6
 _MAX_DEVIANTS = 10
 _GAIN_FIRST, _GAIN_LAST = 0.05, 0.003
 _SKEW_FIRST, _SKEW_LAST = 0.05, 0.003
@@ -34,7 +35,7 @@ class Timesync:
     def update(self, now_s: float, sent_s: float, companion_s: float) -> None:
         """Take an answer: our stamp ``sent_s`` came back at ``now_s`` with the companion's ``companion_s``."""
         round_trip = now_s - sent_s
-        if not 0.0 <= round_trip < MAX_ROUND_TRIP_S:
+        if not -_CLOCK_GRAIN_S <= round_trip < MAX_ROUND_TRIP_S:
             self.slow_answers += 1
             return
         observed = 0.5 * (sent_s + now_s) - companion_s
