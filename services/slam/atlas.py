@@ -84,6 +84,14 @@ def _keyframes(k: int, n: int, cells: int) -> Keyframes:
     )  # fmt: skip
 
 
+def copy_over(grown: Points | Keyframes, old: Points | Keyframes) -> None:
+    """Copy all arrays of ``old`` into the beginnings of those of ``grown``."""
+    new_arrays: tuple[NDArray, ...] = tuple(grown)
+    old_arrays: tuple[NDArray, ...] = tuple(old)
+    for a, b in zip(new_arrays, old_arrays, strict=True):
+        a[: len(b)] = b
+
+
 class Atlas:
     """Owns the arrays, hands out slots and grows."""
 
@@ -112,8 +120,7 @@ class Atlas:
         if len(free) < count:
             old = self.points
             grown = _points(2 * len(old.n) + count)
-            for a, b in zip(grown, old, strict=True):
-                a[: len(b)] = b
+            copy_over(grown, old)
             self.points = grown
             free = np.flatnonzero(grown.n == 0)
         return free[:count].astype(np.int32)
@@ -124,8 +131,7 @@ class Atlas:
         if not len(free):
             old = self.keyframes
             grown = _keyframes(2 * len(old.n), self._features, self._cells)
-            for a, b in zip(grown, old, strict=True):
-                a[: len(b)] = b
+            copy_over(grown, old)
             self.keyframes = grown
             free = np.flatnonzero(grown.n == 0)
         k, n, kf = int(free[0]), len(features), self.keyframes

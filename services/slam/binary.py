@@ -15,11 +15,11 @@ WORDS = 4
 
 
 @intrinsic
-def popcount(typing_context: Any, word: Any) -> Any:
+def popcount(typing_context: object, word: object) -> object:
     """Return the number of ones in a uint64 (compiled code only)."""
     del typing_context, word
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+    def codegen(context: object, builder: Any, signature: object, args: Any) -> object:  # noqa: ANN401 - llvmlite's
         del context, signature
         return builder.ctpop(args[0])
 
@@ -31,8 +31,8 @@ def hamming(a: U64, b: U64) -> int:
     """Return the number of bits in which two descriptors (4,) differ."""
     total = np.uint64(0)
     for k in range(WORDS):
-        total += popcount(a[k] ^ b[k])
-    return np.int64(total)
+        total += popcount(a[k] ^ b[k])  # type: ignore[call-arg]
+    return int(total)
 
 
 @njit(cache=True, nogil=True)

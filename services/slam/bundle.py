@@ -98,7 +98,7 @@ def invert3(A: F64, damping: float, out: F64) -> None:
 
 
 @njit(cache=True, nogil=True)
-def linearise_point(
+def linearise_point(  # noqa: C901 - the unrolled products of small matrices
     problem: Problem, camera: F64, m: int, robust: bool, free: int, S: F64, g: F64, W: F64, Hp: F64, bp: F64
 ) -> None:
     """Add one point's observations to the cameras' blocks of ``S`` and ``g``; fill its own ``Hp``, ``bp`` and ``W``."""

@@ -48,7 +48,7 @@ class Features:
 
 
 @njit(cache=True, nogil=True)
-def spread(xy: F64, response: F64, octave: I32, keep: int, width: int, height: int) -> NDArray[np.int64]:
+def spread(xy: F64, response: F64, keep: int, width: int, height: int) -> NDArray[np.int64]:
     """Return at most ``keep`` indices, strong and even: round by round the next best of each image cell.
 
     Cells are about as many as half of the features wanted; ties fall to the earlier index.
@@ -125,7 +125,8 @@ class Extractor:
 
         self._intrinsics = intrinsics
         self._config = config
-        self._orb: Any = cv2.ORB_create(
+        make_orb: Any = cv2.ORB_create  # type: ignore[attr-defined]  # missing from the stubs
+        self._orb: Any = make_orb(
             nfeatures=int(2.0 * config.features), scaleFactor=config.scale, nlevels=config.levels,
             edgeThreshold=_EDGE_PX, patchSize=31, fastThreshold=config.fast_threshold_low,
         )  # fmt: skip
@@ -141,7 +142,7 @@ class Extractor:
         table = np.array([(*k.pt, k.response, k.angle, k.octave) for k in keypoints])
         octave = table[:, 4].astype(np.int32)
         height, width = grey.shape
-        pick = spread(table[:, :2], table[:, 2], octave, self._config.features, width, height)
+        pick = spread(table[:, :2], table[:, 2], self._config.features, width, height)
         xy = np.ascontiguousarray(table[pick, :2])
         desc = np.ascontiguousarray(descriptors[pick]).view(np.uint64)
         depth = sample_depth(depth_m, xy, self._config.min_depth_m, 10.0 * self._config.max_depth_m)

@@ -100,6 +100,12 @@ class Mapping:
         fixed = order[counts[order] > 0][: 2 * self.config.window_keyframes]
         self.adjust(ids, window, fixed.astype(np.int32), 5, 5)
 
+    def adjust_all(self) -> None:
+        """Bundle adjustment of every keyframe but the first, and every point."""
+        slots = self.atlas.slots
+        ids = points_of(self.atlas.points, self.atlas.keyframes, slots)
+        self.adjust(ids, slots[1:], slots[:1], 10, 10)
+
     def adjust(self, ids: I32, free: I32, fixed: I32, robust_iterations: int, iterations: int) -> None:
         """Adjust ``free`` keyframes and points ``ids``, then drop the observations that do not fit."""
         atlas, camera = self.atlas, self.camera
@@ -110,9 +116,9 @@ class Mapping:
         index = np.full(len(kf.n), -1, np.int32)
         index[slots] = np.arange(len(slots))
         problem = build(atlas.points, kf, ids, slots, index, camera.variance, camera.disparity_info)
-        adjust(problem, camera.array, len(free), robust_iterations, True)
+        adjust(problem, camera.array, len(free), robust_iterations, robust=True)
         gate(chi_squares(problem, camera.array), problem.info, 1.0, problem.use)
-        adjust(problem, camera.array, len(free), iterations, False)
+        adjust(problem, camera.array, len(free), iterations, robust=False)
         gate(chi_squares(problem, camera.array), problem.info, 1.0, problem.use)
         kf.R[free], kf.t[free] = problem.R[: len(free)], problem.t[: len(free)]
         atlas.points.pos[ids] = problem.X

@@ -18,7 +18,7 @@ _ANGLE_BINS = 30
 
 
 @njit(cache=True, nogil=True)
-def match_windows(
+def match_windows(  # noqa: C901 - one loop over one window
     place: F64,
     radius: F64,
     low: I32,
@@ -141,7 +141,7 @@ def project(
         if c < 0.5:
             continue
         place[i, 0], place[i, 1], place[i, 2] = u, v, camera[4] / z
-        level = int(math.ceil(math.log(far[p] / distance) / log_scale))
+        level = math.ceil(math.log(far[p] / distance) / log_scale)
         octave[i] = min(max(level, 0), levels - 1)
         cosine[i] = c
         seen += 1

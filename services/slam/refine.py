@@ -18,6 +18,9 @@ from services.slam.observe import (
     residual,
 )
 
+EXACT = False
+"""For ``robust``: plain squares."""
+
 F64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
@@ -95,11 +98,11 @@ def refine_pose(
             step_pose(R, t, b)
             if b[0] ** 2 + b[1] ** 2 + b[2] ** 2 + b[3] ** 2 + b[4] ** 2 + b[5] ** 2 < 1e-14:
                 break
-        accumulate(R, t, points, obs, info, camera, use, False, chi2, H, g)
+        accumulate(R, t, points, obs, info, camera, use, EXACT, chi2, H, g)
         count = gate(chi2, info, 1.0, use)
         if count < 6:
             return count, 0.0
-    accumulate(R, t, points, obs, info, camera, use, False, chi2, H, g)
+    accumulate(R, t, points, obs, info, camera, use, EXACT, chi2, H, g)
     total = 0.0
     for i in range(n):
         if use[i]:

@@ -15,54 +15,18 @@ from schemas.camera import Intrinsics
 from schemas.slam import GraphReason, SlamStatus
 from services.common.geometry import inverse, orthonormal, pose
 from services.slam import gravity
-from services.slam.atlas import Atlas
+from services.slam.atlas import Atlas, shared_counts
 from services.slam.camera import camera_model
 from services.slam.config import SlamConfig
 from services.slam.features import Extractor, Features
 from services.slam.mapping import Mapping
-from services.slam.tracking import Tracked, Tracking, moved, still_points
+from services.slam.results import GraphUpdate, NewKeyframe, TrackResult
+from services.slam.tracking import Tracked, Tracking
 
 F64 = NDArray[np.float64]
 
 _MIN_START_POINTS = 100
 """Features with depth that a first keyframe needs."""
-
-
-@dataclass(frozen=True, slots=True)
-class NewKeyframe:
-    """A keyframe that has just joined the map."""
-
-    keyframe_id: int
-    T_map_camera: F64
-
-
-@dataclass(frozen=True, slots=True)
-class GraphUpdate:
-    """All keyframes of the map and where they stand now."""
-
-    version: int
-    reason: GraphReason
-    nodes: tuple[tuple[int, F64], ...]
-    """(keyframe id, T_map_camera)."""
-
-
-@dataclass(frozen=True, slots=True)
-class TrackResult:
-    """What slam knows after one frame."""
-
-    stamp_ns: int
-    status: SlamStatus
-    T_map_camera: F64 | None
-    covariance: F64 | None
-    """(6, 6) of (x, y, z, rx, ry, rz), left perturbation in the map frame."""
-    keyframe_id: int | None
-    T_keyframe_camera: F64 | None
-    new_keyframes: list[NewKeyframe]
-    graph: GraphUpdate | None
-    reset_counter: int
-    graph_version: int
-    inliers: int
-    up_sigma_rad: float
 
 
 @dataclass(slots=True)
@@ -150,7 +114,7 @@ class Slam:
         return joined[0]
 
     def _accept(self, stamp_ns: int, frame: Tracked) -> TrackResult:
-        """A frame has its pose: remember it, and make a keyframe of it when the map needs one."""
+        """Remember a frame that has its pose, and make a keyframe of it when the map needs one."""
         new: list[NewKeyframe] = []
         graph = None
         if self._last is not None:
@@ -173,8 +137,6 @@ class Slam:
         return self._result(stamp_ns, "tracking", frame, new, graph)
 
     def _set_anchor(self, frame: Tracked) -> None:
-        from services.slam.atlas import shared_counts
-
         kf = self.atlas.keyframes
         counts = shared_counts(self.atlas.points, frame.point, len(kf.n))
         k = int(np.lexsort((-kf.serial, -counts))[0])
@@ -197,6 +159,15 @@ class Slam:
         least = 3 if len(atlas.slots) > 2 else 1
         reference = int(np.count_nonzero(atlas.points.n[ids] >= least))
         return frame.inliers < config.keyframe_ratio * reference
+
+    def polish(self) -> GraphUpdate | None:
+        """Adjust the whole map once, when there is time for it; return the new graph, None when nothing was there."""
+        slots = self.atlas.slots
+        if len(slots) < 2:
+            return None
+        self.mapping.adjust_all()
+        self.graph_version += 1
+        return self._graph("full_ba")
 
     def _lost(self, stamp_ns: int) -> TrackResult:
         return self._result(stamp_ns, "lost", None, [], None)

@@ -121,7 +121,7 @@ class Tracking:
         return count, use, H, chi2
 
     def _follow_blind(self, last: Tracked, features: Features, world: F64, known: I32, usable: Bool) -> Tracked | None:
-        """The wide search: descriptors alone, then RANSAC."""
+        """Search widely: descriptors alone, then RANSAC."""
         queries = np.flatnonzero(usable)
         if not len(queries) or not len(features):
             return None
@@ -145,7 +145,7 @@ class Tracking:
             np.ascontiguousarray(world[queries]), np.ascontiguousarray(features.uv[match[queries]]), K, None,
             iterationsCount=300, reprojectionError=4.0, confidence=0.9999, flags=cv2.SOLVEPNP_AP3P,
         )  # fmt: skip
-        if not ok or inliers is None or len(inliers) < 10:
+        if not ok or len(inliers) < 10:
             return None
         R, _ = cv2.Rodrigues(r)
         kept = np.full_like(match, -1)

@@ -1,0 +1,160 @@
+"""slam as a process: RGB-D frames in; poses, keyframes and the graph out."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.camera import Intrinsics, RgbdFrame
+from schemas.slam import Graph, GraphNode, Keyframe, Pose, Transform
+from schemas.topics import CAMERA_RGBD, SLAM_GRAPH, SLAM_KEYFRAME, SLAM_POSE, VEHICLE_STATE
+from schemas.vehicle import VehicleState
+from services.camera.codecs import FrameError, decode_colour, decode_depth_raw, recode
+from services.common.context import Context
+from services.common.geometry import R_BODY_CAMERA, Matrix, rotation_from_quaternion, to_transform
+from services.slam.config import SlamConfig
+from services.slam.results import GraphUpdate, TrackResult
+from services.slam.slam import Slam
+from services.slam.warm import warm
+
+_JPEG_QUALITY = 80
+_ATTITUDE_AGE_NS = 200_000_000
+_IDLE_NS = 1_000_000_000
+"""After so long without a frame the map is polished."""
+
+
+def build(context: Context) -> SlamService:
+    """Warm the kernels and register the work; the returned service's ``slam`` holds the final trajectory."""
+    warm()
+    service = SlamService(context, context.config.slam)
+    context.on(CAMERA_RGBD, service.on_frame)
+    context.on(VEHICLE_STATE, service.on_vehicle)
+    context.every(0.5, service.on_idle)
+    return service
+
+
+class SlamService:
+    """Decodes, calls the core and publishes; keyframe and graph go out before the pose that rests on them."""
+
+    def __init__(self, context: Context, config: SlamConfig) -> None:
+        self.slam: Slam | None = None
+        self._context = context
+        self._config = config
+        self._intrinsics: Intrinsics | None = None
+        self._up_body: tuple[int, Matrix] | None = None
+        self._last_stamp_ns = -1
+        self._last_frame_ns = 0
+        self._polished = True
+
+    def on_vehicle(self, state: VehicleState) -> None:
+        """Keep the autopilot's idea of up (its roll and pitch)."""
+        if state.quaternion_map_body is None or not state.connected:
+            return
+        up_camera = R_BODY_CAMERA.T @ rotation_from_quaternion(state.quaternion_map_body).T @ np.array([0.0, 0.0, 1.0])
+        self._up_body = (state.stamp_ns, up_camera)
+
+    def on_frame(self, frame: RgbdFrame) -> None:
+        """Locate one frame; a bad one is dropped, counted and told."""
+        health = self._context.health
+        health.count("frames")
+        try:
+            grey, depth_raw = self._decode(frame)
+        except FrameError as error:
+            health.count("dropped_bad_frames")
+            health.note("camera/rgbd", f"{error}; the frame was dropped")
+            return
+        health.note("camera/rgbd", "")
+        slam = self._slam_for(frame.intrinsics)
+        with health.timed("track"):
+            depth_m = depth_raw.astype(np.float32) / np.float32(frame.intrinsics.depth_scale)
+            accel = None if frame.accel_camera is None else np.array(frame.accel_camera)
+            result = slam.track(frame.stamp_ns, grey, depth_m, accel, self._attitude(frame.stamp_ns))
+        self._last_stamp_ns, self._polished = frame.stamp_ns, False
+        self._last_frame_ns = self._context.clock.now_ns()
+        if result.status == "lost":
+            health.count("lost_frames")
+        self._publish(frame, result)
+
+    def on_idle(self) -> None:
+        """Polish the map when no frame has come for a while (the end of a recording, a pause)."""
+        if self.slam is None or self._polished or self._context.clock.now_ns() - self._last_frame_ns < _IDLE_NS:
+            return
+        self._polished = True
+        with self._context.health.timed("polish"):
+            graph = self.slam.polish()
+        if graph is not None:
+            self._publish_graph(self._last_stamp_ns, graph)
+
+    def _decode(self, frame: RgbdFrame) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+        import cv2
+
+        if self._intrinsics is not None and frame.intrinsics != self._intrinsics:
+            raise FrameError(
+                f"frame {frame.seq}: its camera ({frame.intrinsics.width}x{frame.intrinsics.height}, fx {frame.intrinsics.fx:g}) is "
+                f"not the one this map was begun with ({self._intrinsics.width}x{self._intrinsics.height}, fx "
+                f"{self._intrinsics.fx:g}); restart slam for another camera"
+            )
+        if frame.stamp_ns <= self._last_stamp_ns:
+            raise FrameError(f"frame {frame.seq}: stamp {frame.stamp_ns} is not after {self._last_stamp_ns}")
+        grey = cv2.cvtColor(decode_colour(frame), cv2.COLOR_BGR2GRAY)
+        return grey.astype(np.uint8, copy=False), decode_depth_raw(frame)
+
+    def _slam_for(self, intrinsics: Intrinsics) -> Slam:
+        if self.slam is None:
+            self._intrinsics = intrinsics
+            self.slam = Slam(intrinsics, self._config)
+        return self.slam
+
+    def _attitude(self, stamp_ns: int) -> Matrix | None:
+        if self._up_body is None or abs(stamp_ns - self._up_body[0]) > _ATTITUDE_AGE_NS:
+            return None
+        return self._up_body[1]
+
+    def _publish(self, frame: RgbdFrame, result: TrackResult) -> None:
+        if result.new_keyframes:
+            coded = recode(frame, "jpeg", "zstd", _JPEG_QUALITY)
+            for new in result.new_keyframes:
+                self._context.publish(SLAM_KEYFRAME, Keyframe(
+                    keyframe_id=new.keyframe_id, stamp_ns=frame.stamp_ns, map_id=self._map_id,
+                    graph_version=result.graph_version, T_map_camera=to_transform(new.T_map_camera),
+                    intrinsics=frame.intrinsics, depth_encoding="zstd", depth=bytes(coded.depth),
+                    colour_jpeg=bytes(coded.colour),
+                ))  # fmt: skip
+            self._context.health.count("keyframes", len(result.new_keyframes))
+        if result.graph is not None:
+            self._publish_graph(frame.stamp_ns, result.graph)
+        self._context.publish(SLAM_POSE, pose_message(frame, result, self._map_id, self._processing_ms()))
+
+    def _publish_graph(self, stamp_ns: int, graph: GraphUpdate) -> None:
+        assert self.slam is not None
+        nodes = tuple(GraphNode(keyframe_id=i, T_map_camera=to_transform(T)) for i, T in graph.nodes)
+        self._context.publish(SLAM_GRAPH, Graph(
+            stamp_ns=stamp_ns, map_id=self._map_id, version=graph.version, reset_counter=self.slam.reset_counter,
+            reason=graph.reason, nodes=nodes, up_sigma_rad=self.slam.up_sigma_rad,
+        ))  # fmt: skip
+        self._context.health.count("graphs")
+
+    @property
+    def _map_id(self) -> str:
+        assert self.slam is not None
+        return self.slam.map_id
+
+    def _processing_ms(self) -> float:
+        return self._context.health.stage_ms["track"][-1]
+
+
+def pose_message(frame: RgbdFrame, result: TrackResult, map_id: str, processing_ms: float) -> Pose:
+    """Return the message of one frame's result."""
+    relative: Transform | None = None
+    if result.T_keyframe_camera is not None:
+        relative = to_transform(result.T_keyframe_camera)
+    covariance = None
+    if result.covariance is not None:
+        covariance = tuple(float(c) for c in result.covariance[np.triu_indices(6)])
+    return Pose(
+        stamp_ns=frame.stamp_ns, seq=frame.seq, map_id=map_id, status=result.status,
+        T_map_camera=None if result.T_map_camera is None else to_transform(result.T_map_camera),
+        covariance=covariance, reset_counter=result.reset_counter, graph_version=result.graph_version,
+        keyframe_id=result.keyframe_id, T_keyframe_camera=relative, inliers=result.inliers,
+        up_sigma_rad=result.up_sigma_rad, processing_ms=processing_ms,
+    )  # fmt: skip
