@@ -1,0 +1,125 @@
+"""What the detector holds of the map: submaps, their points in the map frame, and from where they were seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.mapping import Submap
+from services.common.geometry import inverse
+from services.detector.model import Floats, Views
+
+
+@dataclass(slots=True)
+class _Held:
+    version: int
+    T_map_submap: Floats
+    local_m: NDArray[np.float32] = field(repr=False)
+    map_m: NDArray[np.float32] = field(repr=False)
+    view: NDArray[np.int32] = field(repr=False)
+    origins_local_m: Floats = field(repr=False)
+    tan_half: tuple[float, float] = (0.0, 0.0)
+
+
+class MapStore:
+    """Submaps by id, in order of arrival."""
+
+    def __init__(self) -> None:
+        self.map_id = ""
+        self.graph_version = 0
+        self.changed_points = 0
+        """Points that came, went or moved since ``settle``."""
+        self._held: dict[int, _Held] = {}
+
+    def __len__(self) -> int:
+        return sum(len(h.local_m) for h in self._held.values())
+
+    def clear(self, map_id: str) -> None:
+        """Begin a new map."""
+        self.map_id, self.graph_version, self._held = map_id, 0, {}
+        self.changed_points = 0
+
+    def settle(self) -> None:
+        """Note that all changes have been looked at."""
+        self.changed_points = 0
+
+    def take(self, submap: Submap) -> bool:
+        """Take up a submap message; return False when its points are missing here (ask for the whole map)."""
+        self.graph_version = max(self.graph_version, submap.graph_version)
+        held = self._held.get(submap.submap_id)
+        if submap.removed:
+            gone = self._held.pop(submap.submap_id, None)
+            self.changed_points += len(gone.local_m) if gone else 0
+            return True
+        if len(submap.points_m) == 0 and (held is None or held.version != submap.version):
+            return False
+        if held is not None and held.version > submap.version:
+            return True  # an answer to a query that a newer delta has overtaken
+        T = submap.T_map_submap
+        if held is None or held.version != submap.version:
+            held = _Held(
+                submap.version, T, submap.points_m, _placed(submap.points_m, T), submap.view.astype(np.int32),
+                submap.origins_m.astype(np.float64), _field_of_view(submap.points_m),
+            )  # fmt: skip
+            self._held[submap.submap_id] = held
+        else:
+            held.T_map_submap, held.map_m = T, _placed(held.local_m, T)
+        self.changed_points += len(held.local_m)
+        return True
+
+    def assemble(self) -> tuple[NDArray[np.float32], Views]:
+        """Return all points in the map frame (N, 3) and their views."""
+        points, index, origins, rotations = [np.zeros((0, 3), dtype=np.float32)], [np.zeros(0, dtype=np.int32)], [], []
+        tan_half = (0.0, 0.0)
+        count = 0
+        for held in self._held.values():
+            T = held.T_map_submap
+            points.append(held.map_m)
+            index.append(held.view + np.int32(count))
+            origins.append(held.origins_local_m @ T[:3, :3].T + T[:3, 3])
+            rotations.extend([T[:3, :3]] * len(held.origins_local_m))
+            count += len(held.origins_local_m)
+            tan_half = (max(tan_half[0], held.tan_half[0]), max(tan_half[1], held.tan_half[1]))
+        views = Views(
+            np.concatenate(index), np.concatenate(origins) if origins else np.zeros((0, 3)),
+            np.array(rotations) if rotations else None, tan_half if min(tan_half) > 0.0 else None,
+        )  # fmt: skip
+        return np.concatenate(points), views
+
+    def poses(self) -> dict[int, Floats]:
+        """Return where each submap stands."""
+        return {submap_id: held.T_map_submap for submap_id, held in self._held.items()}
+
+
+def anchor_of(position_m: Floats, poses: dict[int, Floats], reach_m: float = 6.0) -> int | None:
+    """Return the submap (id) that looks at a place most squarely, None when none does."""
+    best, score = None, 0.0
+    for submap_id, T in poses.items():
+        to = position_m - T[:3, 3]
+        distance = float(np.hypot(to[0], to[1]))
+        if not 0.3 < distance < reach_m:
+            continue
+        forward = float(T[:2, 2] @ to[:2]) / distance
+        if forward > score:
+            best, score = submap_id, forward
+    return best
+
+
+def moved_with(position_m: Floats, before: Floats, after: Floats) -> Floats:
+    """Return where a place goes when its submap is moved from one pose to another."""
+    return (after @ inverse(before) @ np.append(position_m, 1.0))[:3]
+
+
+def _placed(points_m: NDArray[np.float32], T: Floats) -> NDArray[np.float32]:
+    return (points_m @ T[:3, :3].T.astype(np.float32) + T[:3, 3].astype(np.float32)).astype(np.float32)
+
+
+def _field_of_view(points_m: NDArray[np.float32]) -> tuple[float, float]:
+    """Return the tangents of half the field of view (horizontal, vertical) that the points of a camera span."""
+    far = points_m[points_m[:, 2] > 0.5]
+    if len(far) < 100:
+        return (0.0, 0.0)
+    x, y = np.abs(far[:, 0] / far[:, 2]), np.abs(far[:, 1] / far[:, 2])
+    return float(np.percentile(x, 99.5)), float(np.percentile(y, 99.5))

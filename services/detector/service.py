@@ -1,0 +1,128 @@
+"""The detector as a service: submaps in, the list of trees out, with ids that stay."""
+
+from __future__ import annotations
+
+from schemas.codec import Wire
+from schemas.mapping import Submap
+from schemas.topics import MAP_CLOUD, TREES_LIST
+from schemas.trees import Tree, TreeList
+from services.common.context import Context
+from services.detector.config import DetectorServiceConfig
+from services.detector.detect import detect_trees
+from services.detector.identity import Identities
+from services.detector.map_store import MapStore, anchor_of, moved_with
+from services.detector.model import DetectionResult, Floats
+from services.detector.report import as_tree
+
+_ASK_TIMEOUT_S = 2.0
+
+
+class DetectorService:
+    """Keeps the map, detects when it changed, publishes what changed in the list."""
+
+    def __init__(self, context: Context, config: DetectorServiceConfig) -> None:
+        self._context = context
+        self._config = config
+        self._store = MapStore()
+        self._identities = Identities(config)
+        self._anchored: dict[int, Floats] = {}
+        """Poses of the submaps at the last detection."""
+        self._incomplete = False
+        self._version = 0
+        self._published: TreeList | None = None
+        self.result: DetectionResult | None = None
+        """Of the last detection, for explanations."""
+        context.on(MAP_CLOUD, self.on_submap)
+        context.every(1.0 / config.max_rate_hz, self.on_timer)
+        context.answer_state(TREES_LIST, self.state)
+
+    def on_submap(self, submap: Submap) -> None:
+        """Take up a change of the map."""
+        if submap.map_id != self._store.map_id:
+            if submap.removed:
+                return
+            self._store.clear(submap.map_id)
+            self._identities.clear()
+            self._anchored = {}
+        if not self._store.take(submap):
+            self._incomplete = True
+
+    def on_timer(self) -> None:
+        """Detect when the map changed since the last time."""
+        if self._incomplete:
+            self._fetch_whole_map()
+        if self._store.changed_points > 0:
+            self._detect()
+            self._publish()
+
+    def final_trees(self) -> list[Tree]:
+        """Return the trees of the map as it is now; those that the last look at it did not confirm are left out."""
+        if self._store.changed_points > 0:
+            self._detect()
+        return self._trees(confirmed=True)
+
+    def state(self) -> list[Wire]:
+        """Return the latest list, if there is one."""
+        return [self._published] if self._published is not None else []
+
+    def _fetch_whole_map(self) -> None:
+        self._incomplete = False
+        replies = self._context.ask(MAP_CLOUD, None, Submap, _ASK_TIMEOUT_S)
+        self._context.health.count("map_queries")
+        for submap in replies:
+            if submap.map_id == self._store.map_id and len(submap.points_m) > 0:
+                self._store.take(submap)
+
+    def _detect(self) -> None:
+        health = self._context.health
+        self._follow_corrections()
+        with health.timed("assemble"):
+            points, views = self._store.assemble()
+        self._store.settle()
+        with health.timed("detect"):
+            self.result = detect_trees(points, (0.0, 0.0, 1.0), views, self._config.slicing)
+        self._identities.update(self.result.trunks)
+        self._anchored = dict(self._store.poses())
+        health.count("detections")
+
+    def _follow_corrections(self) -> None:
+        """Move the expected place of each tree with the submap that sees it best."""
+        poses = self._store.poses()
+        for tree in self._identities.trees:
+            anchor = anchor_of(tree.expected_m, self._anchored)
+            if anchor is not None and anchor in poses:
+                tree.expected_m = moved_with(tree.expected_m, self._anchored[anchor], poses[anchor])
+
+    def _trees(self, *, confirmed: bool) -> list[Tree]:
+        kept = [t for t in self._identities.trees if t.missed == 0 or not confirmed]
+        return [as_tree(t.trunk, t.tree_id, t.observations) for t in sorted(kept, key=lambda t: t.tree_id)]
+
+    def _publish(self) -> None:
+        trees = tuple(self._trees(confirmed=False))
+        last = self._published
+        if last is not None and last.map_id == self._store.map_id and not self._news(last.trees, trees):
+            return
+        self._version += 1
+        self._published = TreeList(
+            stamp_ns=self._context.clock.now_ns(), map_id=self._store.map_id, version=self._version,
+            graph_version=self._store.graph_version, trees=trees,
+        )  # fmt: skip
+        self._context.publish(TREES_LIST, self._published)
+
+    def _news(self, old: tuple[Tree, ...], new: tuple[Tree, ...]) -> bool:
+        if [t.id for t in old] != [t.id for t in new]:
+            return True
+        limit = self._config.publish_move_m
+        return any(
+            abs(a.x_m - b.x_m) > limit or abs(a.y_m - b.y_m) > limit or abs(a.radius_m - b.radius_m) > limit
+            or a.suitable != b.suitable or abs(a.confidence - b.confidence) > 0.02
+            for a, b in zip(old, new, strict=True)
+        )  # fmt: skip
+
+
+def build(context: Context) -> DetectorService:
+    """Warm the kernels and join the service to the bus."""
+    from services.detector.warm import warm
+
+    warm()
+    return DetectorService(context, context.config.detector)

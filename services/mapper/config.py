@@ -1,0 +1,32 @@
+"""Configuration of the mapper."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class MapperConfig(BaseModel):
+    """Dense mapping: one submap per keyframe, filtered, placed by its keyframe's pose."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    min_range_m: float = Field(default=0.5, gt=0.0)
+    max_range_m: float = Field(default=6.0, gt=0.0)
+    """Pass-through: depth outside is no data."""
+    voxel_m: float = Field(default=0.01, gt=0.0)
+    range_noise_per_m: float = Field(default=0.0020, ge=0.0)
+    """Depth noise at one metre, growing with the square of range."""
+    edge_sigmas: float = Field(default=5.0, gt=0.0)
+    edge_floor_m: float = Field(default=0.03, gt=0.0)
+    """Depth steps between neighbouring pixels beyond ``edge_floor_m + edge_sigmas * noise`` are edges."""
+    outlier_sigmas: float = Field(default=2.5, gt=0.0)
+    """Statistical outlier removal: points whose neighbours are further than the mean by so many deviations go."""
+    per_voxel: int = Field(default=2, ge=1)
+    """Points of different keyframes that one voxel of the whole map takes up: bounds the map by its surface."""
+    nearer: float = Field(default=0.7, gt=0.0, le=1.0)
+    """A full voxel still takes a point that was seen from less than this share of the range of those in it."""
+    max_points: int = Field(default=3_000_000, gt=0)
+    """Memory bound of the whole map (about 20 bytes a point); beyond it the oldest submaps are thinned."""
+    move_m: float = Field(default=0.001, gt=0.0)
+    move_rad: float = Field(default=0.0005, gt=0.0)
+    """A submap that the graph moved by less is not sent again."""

@@ -1,0 +1,25 @@
+"""Compile or load every kernel of the mapper before it is needed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from services.mapper.config import MapperConfig
+
+
+def warm() -> None:
+    """Run every kernel on a tiny image."""
+    from schemas.camera import Intrinsics
+    from services.mapper.cloud import keyframe_cloud, pixel_rays
+    from services.mapper.dense_map import DenseMap
+
+    intrinsics = Intrinsics(width=16, height=12, fx=20.0, fy=20.0, cx=7.5, cy=5.5)
+    cloud = keyframe_cloud(
+        np.full((12, 16), 2.0, dtype=np.float32),
+        np.zeros((12, 16, 3), dtype=np.uint8),
+        pixel_rays(intrinsics),
+        MapperConfig(),
+    )
+    dense = DenseMap(MapperConfig())
+    dense._reserve(100_000)  # noqa: SLF001 - compiles the growing of the table as well
+    dense.add(0, 0, cloud, np.eye(4))
