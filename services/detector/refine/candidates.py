@@ -31,6 +31,8 @@ MAX_RUNS = 4096
 _MAX_OBJECTS = 24
 _QUICK_POINTS = 250
 _QUICK_ITERATIONS = 7
+_ALIKE_PLACE_M = 0.06
+_ALIKE_RADIUS_M = 0.04
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,6 +176,14 @@ def fit_object(
     rms = float(np.sqrt(stats[1] / stats[0]))
     covariance = np.asarray(np.linalg.inv(H) * (fit.correlation * max(1.0, rms * rms)), dtype=np.float64)
     return Fit(k, p, covariance, int(stats[0]), float(stats[0] / stats[2]), rms)
+
+
+def join_alike(found: Scan, fit: Fit, fits: list[Fit]) -> None:
+    """Give the object of ``fit`` the runs of all objects with the same circle: a trunk that noise or a branch cut."""
+    for other in fits:
+        d = other.parameters - fit.parameters
+        if other.object != fit.object and np.hypot(d[0], d[1]) < _ALIKE_PLACE_M and abs(d[2]) < _ALIKE_RADIUS_M:
+            found.label[found.label == other.object] = fit.object
 
 
 def extent(found: Scan, k: int) -> tuple[tuple[float, float], tuple[int, int], float]:

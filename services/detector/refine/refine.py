@@ -9,7 +9,7 @@ import numpy as np
 
 from schemas.camera import Intrinsics
 from services.detector.refine.associate import associate
-from services.detector.refine.candidates import Fit, Scan, candidates, extent, fit_object, scan
+from services.detector.refine.candidates import Fit, Scan, candidates, extent, fit_object, join_alike, scan
 from services.detector.refine.config import RefinerConfig
 from services.detector.refine.model import Depth, ExpectedTree, Matrix, Measurement, Sight
 from services.detector.refine.view import axis_point, gate_m, pose_offset_covariance, project, sight, window
@@ -47,9 +47,11 @@ def refine(
         return None
     trees = [(tree, _place(tree, view)) for tree in _near(expected, others, gate)]
     found = scan(depth_m, intrinsics, view, expected, reach, trees[0][1], bounds, config)
-    match = associate(candidates(found, trees, gate, config), trees, shift, gate)
+    fits = candidates(found, trees, gate, config)
+    match = associate(fits, trees, shift, gate)
     if match is None:
         return None
+    join_alike(found, match.fit, fits)
     fit = _fit_in_full(found, match.fit, expected, config)
     if fit is None or not acceptable(fit, expected, config):
         return None
