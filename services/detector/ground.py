@@ -170,6 +170,28 @@ def _plane_at(
 
 
 @njit(cache=True, nogil=True)
+def _drop_above_wide_plane(cell_points: Floats, valid: NDArray[np.bool_], x0: float, y0: float, cell: float) -> None:
+    """Drop cells well above the plane of their wider surroundings: a trunk or bush whose own ground was never seen."""
+    nx, ny = valid.shape
+    plane = np.zeros(3)
+    drop = np.zeros((nx, ny), dtype=np.bool_)
+    half = max(2, int(np.ceil(3.0 / cell)))
+    for a in range(nx):
+        for b in range(ny):
+            if not valid[a, b]:
+                continue
+            xc, yc = x0 + (a + 0.5) * cell, y0 + (b + 0.5) * cell
+            if _plane_at(cell_points, valid, a, b, half, xc, yc, plane):
+                e = cell_points[a, b, 2] - plane[0] - plane[1] * (cell_points[a, b, 0] - xc)
+                e -= plane[2] * (cell_points[a, b, 1] - yc)
+                drop[a, b] = e > 0.25
+    for a in range(nx):
+        for b in range(ny):
+            if drop[a, b]:
+                valid[a, b] = False
+
+
+@njit(cache=True, nogil=True)
 def _planes(cell_points: Floats, valid: NDArray[np.bool_], x0: float, y0: float, cell: float, planes: Floats) -> None:
     nx, ny = valid.shape
     whole = np.zeros(3)
@@ -245,6 +267,7 @@ def find_ground(points_m: NDArray[np.floating], frame: Upright, cell_m: float) -
     cell_points, valid = np.zeros((nx, ny, 3)), np.zeros((nx, ny), dtype=np.bool_)
     _choose(lows, counts, cell_points, valid)
     _drop_hanging(cell_points, valid, cell)
+    _drop_above_wide_plane(cell_points, valid, x0, y0, cell)
     planes = np.zeros((nx, ny, 3))
     _planes(cell_points, valid, x0, y0, cell, planes)
     step = max(1, len(points_m) // 200_000)

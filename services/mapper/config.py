@@ -14,6 +14,12 @@ class MapperConfig(BaseModel):
     max_range_m: float = Field(default=6.0, gt=0.0)
     """Pass-through: depth outside is no data."""
     voxel_m: float = Field(default=0.01, gt=0.0)
+    coarse_voxel_m: float = Field(default=0.03, gt=0.0)
+    """Leaf on the ground and in the canopy, where no trunk is measured: most of the points are there."""
+    fine_low_m: float = 0.25
+    fine_high_m: float = 2.6
+    """Heights above the lowest of the neighbourhood between which ``voxel_m`` holds."""
+    ground_cell_m: float = Field(default=0.5, gt=0.0)
     range_noise_per_m: float = Field(default=0.0020, ge=0.0)
     """Depth noise at one metre, growing with the square of range."""
     edge_sigmas: float = Field(default=5.0, gt=0.0)
@@ -21,7 +27,7 @@ class MapperConfig(BaseModel):
     """Depth steps between neighbouring pixels beyond ``edge_floor_m + edge_sigmas * noise`` are edges."""
     outlier_sigmas: float = Field(default=2.5, gt=0.0)
     """Statistical outlier removal: points whose neighbours are further than the mean by so many deviations go."""
-    per_voxel: int = Field(default=2, ge=1)
+    per_voxel: int = Field(default=1, ge=1)
     """Points of different keyframes that one voxel of the whole map takes up: bounds the map by its surface."""
     nearer: float = Field(default=0.7, gt=0.0, le=1.0)
     """A full voxel still takes a point that was seen from less than this share of the range of those in it."""

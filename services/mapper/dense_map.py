@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from services.common.geometry import inverse, log_rotation
 from services.mapper.cloud import KeyframeCloud
 from services.mapper.config import MapperConfig
+from services.mapper.ground_grid import GroundGrid
 
 Matrix = NDArray[np.float64]
 
@@ -43,20 +44,27 @@ class MapCloud:
 
 @njit(cache=True, nogil=True)
 def _admit(
-    points: NDArray[np.float32], T: Matrix, voxel: float, per_voxel: int, nearer: float, table_keys: NDArray[np.int64],
+    points: NDArray[np.float32], T: Matrix, lows: NDArray[np.float32], cell: float, fine_low: float, fine_high: float,
+    fine: float, coarse: float, per_voxel: int, nearer: float, table_keys: NDArray[np.int64],
     table_count: NDArray[np.uint8], table_range: NDArray[np.float32], keep: NDArray[np.bool_],
 ) -> int:  # fmt: skip
     """Enter points into the voxel table; mark those that their voxel takes. Return the number of new voxels."""
     mask = table_keys.shape[0] - 1
+    half = lows.shape[0] // 2
     fresh = 0
     for i in range(points.shape[0]):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
         y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
         z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        a = min(max(int(np.floor(x / cell)) + half, 0), 2 * half - 1)
+        b = min(max(int(np.floor(y / cell)) + half, 0), 2 * half - 1)
+        voxel, level = coarse, np.int64(1)
+        if fine_low <= z - lows[a, b] <= fine_high:
+            voxel, level = fine, np.int64(0)
         key = np.int64(np.floor(x / voxel)) + 1048576
         key = key * np.int64(2097152) + np.int64(np.floor(y / voxel)) + 1048576
-        key = key * np.int64(2097152) + np.int64(np.floor(z / voxel)) + 1048576
+        key = key * np.int64(2097152) + 2 * (np.int64(np.floor(z / voxel)) + 524288) + level
         at = (key * np.int64(-7046029254386353131) >> 20) & mask
         while table_keys[at] != -1 and table_keys[at] != key:
             at = (at + 1) & mask
@@ -87,6 +95,7 @@ class DenseMap:
         self._config = config
         self.map_id = ""
         self.submaps: dict[int, MapSubmap] = {}
+        self._ground = GroundGrid(config.ground_cell_m)
         self._clear_voxels()
 
     @property
@@ -99,6 +108,7 @@ class DenseMap:
         gone = list(self.submaps.values())
         self.submaps = {}
         self.map_id = map_id
+        self._ground = GroundGrid(self._config.ground_cell_m)
         self._clear_voxels()
         return gone
 
@@ -106,12 +116,18 @@ class DenseMap:
         """Take up a keyframe's cloud; return the submaps whose points changed (itself, and any thinned for memory)."""
         keep = np.empty(len(cloud.points_m), dtype=np.bool_)
         self._reserve(len(keep))
+        self._ground.take(cloud.points_m, T_map_camera)
         c = self._config
         self._used += int(
             _admit(
                 cloud.points_m,
                 T_map_camera,
+                self._ground.lows_m,
+                c.ground_cell_m,
+                c.fine_low_m,
+                c.fine_high_m,
                 c.voxel_m,
+                c.coarse_voxel_m,
                 c.per_voxel,
                 c.nearer,
                 self._keys,
@@ -165,7 +181,7 @@ class DenseMap:
         return float(np.linalg.norm(log_rotation(a[:3, :3].T @ b[:3, :3]))) > self._config.move_rad
 
     def _clear_voxels(self, slots: int = 1 << 16) -> None:
-        self._keys = np.full(slots, -1, dtype=np.int64)
+        self._keys: NDArray[np.int64] = np.full(slots, -1, dtype=np.int64)
         self._counts = np.zeros(slots, dtype=np.uint8)
         self._ranges = np.zeros(slots, dtype=np.float32)
         self._used = 0
