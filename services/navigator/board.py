@@ -135,6 +135,8 @@ class Board:
     corners: list[Matrix] = field(default_factory=list)
     planned_ns: int = -1
     dt_s: float = 0.0
+    target_seen_ns: int | None = None
+    """When the target was last tracked in the depth image."""
     _target_stamp_ns: int = -1
     _off_gate: bool = False
     """The depth image shows a trunk where the map has none: not our target, whatever its id."""
@@ -184,6 +186,13 @@ class Board:
         return None if wrong or self._off_gate or t.range_m is None or t.bearing_rad is None else t
 
     @property
+    def target_lost(self) -> bool:
+        """Whether the target has been out of sight for longer than single missed frames last."""
+        if self.target_seen_ns is None:
+            return True
+        return (self.now_ns - self.target_seen_ns) / 1e9 > self.config.failsafe.target_lost_s
+
+    @property
     def flight_z_m(self) -> float:
         """Height of the camera in map for level flight; higher when the target stands uphill."""
         home_z = 0.0 if self.home_m is None else float(self.home_m[2])
@@ -231,7 +240,7 @@ class Board:
         """Make a listed tree the target."""
         self.target_id, self.wanted_id = tree.id, None
         self.ground_z_m = tree.z_m
-        self.axis_m = None
+        self.axis_m = self.target_seen_ns = None
         self.axis_m = axis_at(tree, self.flight_z_m)
         self.dock.clear()
         self.dock_direction, self.corners, self.planned_ns = None, [], -1
@@ -248,7 +257,7 @@ class Board:
 
     def drop_target(self) -> None:
         """Have no target any more."""
-        self.target_id, self.axis_m, self.dock_direction = None, None, None
+        self.target_id, self.axis_m, self.dock_direction, self.target_seen_ns = None, None, None, None
         self.dock.clear()
 
     def _correct(self, c: Correction) -> None:
@@ -289,7 +298,12 @@ class Board:
     def _follow_target(self) -> None:
         self._off_gate = False
         t, here = self.target, self.here
-        if t is None or here is None or not t.measured:
+        if t is None or here is None:
+            return
+        assert self.inputs.target is not None
+        arrived_ns = self.inputs.target.received_ns
+        if not t.measured:
+            self.target_seen_ns = arrived_ns
             return
         if t.range_m is None or t.bearing_rad is None:
             return
@@ -297,6 +311,7 @@ class Board:
         self._off_gate = self.axis_m is None or float(np.linalg.norm(seen - self.axis_m)) > _AXIS_GATE_M
         if self._off_gate or self.axis_m is None or t.stamp_ns <= self._target_stamp_ns:
             return
+        self.target_seen_ns = arrived_ns
         dt = min((t.stamp_ns - self._target_stamp_ns) / 1e9, 1.0)
         self._target_stamp_ns = t.stamp_ns
         self.axis_m = self.axis_m + dt / (dt + _AXIS_TIME_CONSTANT_S) * (seen - self.axis_m)

@@ -34,6 +34,8 @@ class DockConfig(BaseModel):
     aim_m: float = Field(default=0.95, gt=0.0)
     min_m: float = Field(default=0.85, gt=0.0)
     max_m: float = Field(default=1.00, gt=0.0)
+    margin_m: float = Field(default=0.02, ge=0.0)
+    """The believed mean keeps this far inside both limits, so that the true one is inside too."""
     bearing_rad: float = Field(default=math.radians(3.0), gt=0.0)
     window_s: float = Field(default=3.0, gt=0.0)
     still_m: float = Field(default=0.12, gt=0.0)
@@ -55,6 +57,8 @@ class DockConfig(BaseModel):
     def _ordered(self) -> DockConfig:
         if not self.min_m < self.aim_m < self.max_m < self.enter_m < self.leave_m:
             raise ValueError("dock distances must rise: min_m < aim_m < max_m < enter_m < leave_m")
+        if not self.min_m + self.margin_m < self.aim_m < self.max_m - self.margin_m:
+            raise ValueError("dock.aim_m must lie within min_m + margin_m .. max_m - margin_m")
         return self
 
 
@@ -70,7 +74,7 @@ class FailsafeConfig(BaseModel):
     pose_jump_rad: float = Field(default=math.radians(15.0), gt=0.0)
     correction_hold_m: float = Field(default=1.0, gt=0.0)
     """A told correction larger than this is held upon like a jump."""
-    target_lost_s: float = Field(default=0.4, gt=0.0)
+    target_lost_s: float = Field(default=0.45, gt=0.0)
     target_hold_s: float = Field(default=10.0, gt=0.0)
     trees_stale_s: float = Field(default=120.0, gt=0.0)
     trees_hold_s: float = Field(default=15.0, gt=0.0)

@@ -76,7 +76,7 @@ class DockMonitor:
         c = self.config
         if t[-1] < c.window_s - 1e-3:
             return f"seen for {t[-1]:.1f} s of {c.window_s:.1f}"
-        if not c.min_m <= distance_m <= c.max_m:
+        if not c.min_m + c.margin_m <= distance_m <= c.max_m - c.margin_m:
             return f"distance outside {c.min_m:.2f}..{c.max_m:.2f} m"
         if abs(bearing_rad) > c.bearing_rad:
             return "not centred"

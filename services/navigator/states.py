@@ -26,6 +26,9 @@ _TURN_FIRST_RAD = float(np.radians(8.0))
 """Guidance says turn rather than toward beyond this heading error."""
 _CORNER_M = 0.25
 _REPLAN_S = 1.0
+_YAW_LEAD_NS = 300_000_000
+"""The aircraft's yaw follows its setpoint by about this much later."""
+_YAW_INTEGRAL_SHARE = 0.4
 _YAW_CORRECTION_RAD = float(np.radians(8.0))
 
 
@@ -91,7 +94,7 @@ def face(b: Board, since_s: float) -> Result:
     distance, bearing = seen
     still = abs(b.trajectory.yaw_rate_rad_s) < np.radians(2.0)
     if abs(bearing) < _FACING_RAD and still:
-        if b.target is not None:
+        if not b.target_lost:
             return Next("approach", f"tree {b.target_id} in sight, {distance:.2f} m ahead")
         if distance > c.visual_range_m:
             return Next("approach", f"tree {b.target_id} is {distance:.2f} m ahead by the map: nearer to see it")
@@ -168,7 +171,7 @@ def docked(b: Board, since_s: float) -> Result:
         if b.docked_count < b.trees_wanted:
             return Next("undock", f"{b.docked_count} of {b.trees_wanted} trees done")
         return _go_home(b, f"{b.docked_count} of {b.trees_wanted} trees done")
-    if seen is None or b.axis_m is None or b.dock_direction is None or b.target is None:
+    if seen is None or b.axis_m is None or b.dock_direction is None or b.target_lost:
         return Intent("docked", "brake" if b.here is not None else "freeze")
     return Intent("docked", "aim", _station(b, *seen))
 
@@ -239,10 +242,10 @@ def _cruise(b: Board) -> Matrix:
 
 
 def _yaw_to_axis(b: Board) -> float:
-    """Return the setpoint yaw (unwrapped) that looks at the axis from where the camera is."""
+    """Return the setpoint yaw (unwrapped) that looks at the axis from where the camera will be when it is reached."""
     assert b.axis_m is not None
     assert b.here is not None
-    offset = b.axis_m - b.here.position_m[:2]
+    offset = b.axis_m - b.track.predict(b.now_ns + _YAW_LEAD_NS)[:2, 3]
     return b.trajectory.unwrapped(float(np.arctan2(offset[1], offset[0])))
 
 
@@ -276,7 +279,7 @@ def _station(b: Board, distance_m: float, bearing_rad: float) -> Aim:
         gain = c.dock.integral_per_s * b.dt_s
         limit = c.dock.integral_limit_m
         b.dock_offset_m = float(np.clip(b.dock_offset_m + gain * (c.dock.aim_m - distance_m), -limit, limit))
-        turned = b.dock_yaw_rad + gain * bearing_rad
+        turned = b.dock_yaw_rad + _YAW_INTEGRAL_SHARE * gain * bearing_rad
         b.dock_yaw_rad = float(np.clip(turned, -_YAW_CORRECTION_RAD, _YAW_CORRECTION_RAD))
     place = b.axis_m + b.dock_direction * (c.dock.aim_m + b.dock_offset_m)
-    return Aim(_at(b, place), _yaw_to_axis(b) + b.dock_yaw_rad, 0.2, np.radians(15.0), c.approach_gain_per_s)
+    return Aim(_at(b, place), _yaw_to_axis(b) + b.dock_yaw_rad, 0.2, c.turn_rate_rad_s, c.approach_gain_per_s)

@@ -147,26 +147,12 @@ class Bridge:
         self._sent = (position, yaw)
         self.setpoints_sent += 1
         p, v = to_ned(position), to_ned(velocity)
-        return [
-            mav.MAVLink_set_position_target_local_ned_message(
-                (now_ns // 1_000_000) & 0xFFFFFFFF,
-                system,
-                px4.AUTOPILOT_COMPONENT,
-                mav.MAV_FRAME_LOCAL_NED,
-                _USE_POSITION_VELOCITY_YAW_RATE,
-                float(p[0]),
-                float(p[1]),
-                float(p[2]),
-                float(v[0]),
-                float(v[1]),
-                float(v[2]),
-                0.0,
-                0.0,
-                0.0,
-                -yaw,
-                -rate,
-            )  # fmt: skip
-        ]
+        message = mav.MAVLink_set_position_target_local_ned_message(
+            (now_ns // 1_000_000) & 0xFFFFFFFF, system, px4.AUTOPILOT_COMPONENT, mav.MAV_FRAME_LOCAL_NED,
+            _USE_POSITION_VELOCITY_YAW_RATE, float(p[0]), float(p[1]), float(p[2]), float(v[0]), float(v[1]),
+            float(v[2]), 0.0, 0.0, 0.0, -yaw, -rate,
+        )  # fmt: skip
+        return [message]
 
     def _guided(self, now_ns: int) -> tuple[Matrix, float, Matrix, float] | None:
         """Return position, yaw, velocity (body, map) and yaw rate of the guidance in the present map, or None."""

@@ -109,7 +109,7 @@ class SerialWire:
 
     def __init__(self, device: str, baud: int) -> None:
         try:
-            import serial
+            import serial  # type: ignore[import-untyped, unused-ignore]
         except ImportError as error:
             raise InputError(f"serial:{device}: the package pyserial is missing: pip install pyserial") from error
         self._port = serial.Serial(device, baud, timeout=_WAIT_S, write_timeout=_WAIT_S)
@@ -147,20 +147,54 @@ def open_wire(connection: str) -> Wire:
         raise InputError(f"autopilot.connection {connection!r}: {error}") from error
 
 
-class MavlinkLink:
-    """A wire with MAVLink 2 on it. Its thread parses what comes and answers TIMESYNC at once."""
+class Codec:
+    """MAVLink 2 messages to bytes and back; TIMESYNC requests are answered here, with the clock of that very moment."""
 
-    def __init__(self, wire: Wire, component: int, system: int, now_ns: Callable[[], int]) -> None:
-        self._wire = wire
-        self._now_ns = now_ns
+    def __init__(self, component: int, system: int, now_ns: Callable[[], int]) -> None:
         self._mav = mav.MAVLink(None, srcSystem=system, srcComponent=component)
         self._mav.robust_parsing = True
         self._lock = threading.Lock()
+        self._now_ns = now_ns
+        self.bad_bytes = 0
+
+    def identify(self, system: int) -> None:
+        """Speak as a component of this system from now on."""
+        self._mav.srcSystem = system
+
+    def pack(self, message: Any) -> bytes:  # noqa: ANN401
+        """Return the frame of a message; safe from any thread."""
+        with self._lock:
+            data = message.pack(self._mav)
+            self._mav.seq = (self._mav.seq + 1) % 256
+        return bytes(data)
+
+    def take(self, data: bytes, answer: Callable[[bytes], None]) -> list[tuple[Any, int]]:
+        """Return the messages in ``data`` with their time of arrival; ``answer`` sends what cannot wait."""
+        received_ns = self._now_ns()
+        out = []
+        for message in self._mav.parse_buffer(data) or ():
+            kind = message.get_type()
+            if kind == "BAD_DATA":
+                self.bad_bytes += 1
+            elif kind == "TIMESYNC":
+                reply = timesync_answer(message, self._now_ns())
+                if reply is not None:
+                    answer(self.pack(reply))
+            else:
+                out.append((message, received_ns))
+        return out
+
+
+class MavlinkLink:
+    """A wire with MAVLink 2 on it. Its thread parses what comes and answers TIMESYNC at once."""
+
+    def __init__(self, wire: Wire, codec: Codec) -> None:
+        self._wire = wire
+        self.codec = codec
         self._queue: deque[tuple[Any, int]] = deque(maxlen=_MAX_QUEUE)
         self._stopped = threading.Event()
         self.failed = ""
         """Why the wire is dead; empty while it lives."""
-        self.bad_bytes = 0
         self._thread = threading.Thread(target=self._read, name="mavlink", daemon=True)
         self._thread.start()
 
@@ -173,23 +207,24 @@ class MavlinkLink:
 
     def send(self, message: Any) -> None:  # noqa: ANN401
         """Send a message; a wire that fails is told by ``failed``."""
-        with self._lock:
-            data = message.pack(self._mav)
-            self._mav.seq = (self._mav.seq + 1) % 256
-        try:
-            self._wire.write(data)
-        except OSError as error:
-            self.failed = str(error)
+        self._write(self.codec.pack(message))
 
     def identify(self, system: int) -> None:
         """Speak as a component of this system from now on."""
-        self._mav.srcSystem = system
+        self.codec.identify(system)
 
     def close(self) -> None:
         """Stop the thread and close the wire."""
         self._stopped.set()
         self._thread.join(2.0 * _WAIT_S)
         self._wire.close()
+
+    def _write(self, data: bytes) -> None:
+        try:
+            self._wire.write(data)
+            self.failed = ""
+        except OSError as error:
+            self.failed = str(error)
 
     def _read(self) -> None:
         while not self._stopped.is_set():
@@ -201,17 +236,4 @@ class MavlinkLink:
                     return
                 continue
             if data:
-                self._take(data)
-
-    def _take(self, data: bytes) -> None:
-        received_ns = self._now_ns()
-        for message in self._mav.parse_buffer(data) or ():
-            kind = message.get_type()
-            if kind == "BAD_DATA":
-                self.bad_bytes += 1
-            elif kind == "TIMESYNC":
-                answer = timesync_answer(message, self._now_ns())
-                if answer is not None:
-                    self.send(answer)
-            else:
-                self._queue.append((message, received_ns))
+                self._queue.extend(self.codec.take(data, self._write))

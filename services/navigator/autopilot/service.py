@@ -10,7 +10,7 @@ from schemas.topics import MISSION_GUIDANCE, SLAM_POSE, VEHICLE_STATE
 from services.common.context import Context
 from services.navigator.autopilot.bridge import Bridge
 from services.navigator.autopilot.config import AutopilotConfig
-from services.navigator.autopilot.link import Link, MavlinkLink, open_wire
+from services.navigator.autopilot.link import Codec, Link, MavlinkLink, open_wire
 
 
 class Autopilot:
@@ -64,7 +64,8 @@ class Autopilot:
 def build(context: Context) -> None:
     """Start the bridge on a context, over the wire that the configuration names."""
     config: AutopilotConfig = getattr(context.config, "autopilot", None) or AutopilotConfig()
-    link = MavlinkLink(open_wire(config.connection), config.component_id, config.system_id, context.clock.now_ns)
+    codec = Codec(config.component_id, config.system_id, context.clock.now_ns)
+    link = MavlinkLink(open_wire(config.connection), codec)
     atexit.register(link.close)
     on_stop = getattr(context, "on_stop", None)
     if on_stop is not None:

@@ -1,0 +1,212 @@
+"""One flight without rendering: simulated PX4, bridge, mission and the synthetic chain, in one thread and simulated
+time. Faster than real time, the same every time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from schemas.navigation import MissionStateName
+from schemas.slam import Pose
+from schemas.trees import Target, TreeList
+from schemas.vehicle import VehicleState
+from services.common.geometry import Matrix, camera_yaw, pose, wrap_angle
+from services.evaluate.synthetic import ChainErrors, SyntheticChain, TrueTrunk
+from services.navigator.autopilot.bridge import Bridge
+from services.navigator.autopilot.config import AutopilotConfig
+from services.navigator.autopilot.link import Codec
+from services.navigator.board import Event, Inputs, Outputs, Seen
+from services.navigator.config import NavigatorConfig
+from services.navigator.mission import Mission
+from services.simulator.px4.config import Px4Config, WindConfig
+from services.simulator.px4.links import LoopbackLink
+from services.simulator.px4.simulated import SimulatedPx4
+
+TICK_NS = 10_000_000
+_START_NS = 1_700_000_000_000_000_000
+_SERVICES = ("camera", "slam", "mapper", "detector", "refiner", "autopilot")
+_END: frozenset[MissionStateName] = frozenset({"landed", "released", "failed"})
+
+
+@dataclass(frozen=True)
+class FlightCase:
+    """What is flown: the trunks, the weather, the errors, the configuration."""
+
+    seed: int
+    trunks: tuple[TrueTrunk, ...]
+    errors: ChainErrors = field(default_factory=ChainErrors)
+    wind: WindConfig = field(default_factory=WindConfig)
+    navigator: NavigatorConfig = field(default_factory=NavigatorConfig)
+    autopilot: AutopilotConfig = field(default_factory=AutopilotConfig)
+
+
+@dataclass
+class Flight:
+    """The closed loop. ``tick`` it; everything that may fail is a public switch."""
+
+    case: FlightCase
+    now_ns: int = _START_NS
+    events: list[Event] = field(default_factory=list)
+    outputs: Outputs | None = None
+    clearance_m: float = float("inf")
+    """Least distance of the aircraft's centre to a trunk's bark so far."""
+    touches: int = 0
+    dock_errors: list[tuple[float, float]] = field(default_factory=list)
+    """True distance (m) and heading error (rad) at each docking: means over the dock's window."""
+    navigator_alive: bool = True
+    bridge_alive: bool = True
+    silent: set[str] = field(default_factory=set)
+    """Services without health."""
+    setpoints: list[tuple[int, Any]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        rng = np.random.default_rng(self.case.seed)
+        T = pose(np.eye(3), (0.0, 0.0, 0.1))
+        config = Px4Config(wind=self.case.wind)
+        self.px4 = SimulatedPx4(_flat, T, config, int(rng.integers(2**31)))
+        theirs, self._link = LoopbackLink.pair()
+        self.px4.attach(theirs)
+        self.mission = Mission(self.case.navigator)
+        self.bridge = Bridge(self.case.autopilot)
+        self.codec = Codec(self.case.autopilot.component_id, 1, lambda: self.now_ns)
+        T_world_map = pose(np.eye(3), self._camera()[:3, 3])
+        self.chain = SyntheticChain(self.case.trunks, T_world_map, self.case.errors, rng)
+        self._T_world_map = T_world_map
+        self._pose: Seen[Pose] | None = None
+        self._target: Seen[Target] | None = None
+        self._trees: Seen[TreeList] | None = None
+        self._vehicle: Seen[VehicleState] | None = None
+        self._history: list[tuple[float, float]] = []
+        self._ticks = 0
+        self._touching = False
+
+    @property
+    def state(self) -> MissionStateName:
+        """The mission's state."""
+        return self.mission.state
+
+    @property
+    def elapsed_s(self) -> float:
+        """Simulated time flown."""
+        return (self.now_ns - _START_NS) / 1e9
+
+    def order(self, name: Any, tree_id: int | None = None) -> str:  # noqa: ANN401
+        """Give the mission an order; returns why it was refused, or nothing."""
+        verdict = self.mission.order(name, tree_id, self.now_ns)
+        return "" if verdict.accepted else verdict.reason
+
+    def start(self, patience_s: float = 30.0) -> None:
+        """Wait for the autopilot to fuse vision, then order the mission."""
+        for _ in range(round(patience_s * 1e9 / TICK_NS)):
+            self.tick()
+            if self._vehicle is not None and self._vehicle.message.vision_fused:
+                break
+        refusal = self.order("start")
+        if refusal:
+            raise RuntimeError(f"start refused: {refusal}")
+
+    def run(self, until: tuple[MissionStateName, ...] = (), limit_s: float = 300.0) -> MissionStateName:
+        """Tick until one of the states, the end of the mission, or the limit."""
+        for _ in range(round(limit_s * 1e9 / TICK_NS)):
+            self.tick()
+            if self.state in until or self.state in _END:
+                break
+        return self.state
+
+    def tick(self) -> None:
+        """Let 10 ms pass for everybody."""
+        self.now_ns += TICK_NS
+        self._ticks += 1
+        self.px4.step(TICK_NS / 1e9)
+        self._judge()
+        self.chain.target_id = self.mission.board.target_id
+        self.chain.observe(self._camera(), self.now_ns)
+        for message in self.chain.due(self.now_ns):
+            self._deliver(message)
+        self._run_bridge()
+        if self.navigator_alive and self._ticks % 5 == 0:
+            self._run_mission()
+
+    def _deliver(self, message: Pose | Target | TreeList) -> None:
+        if isinstance(message, Pose):
+            self._pose = Seen(message, self.now_ns)
+            if self.bridge_alive:
+                self.bridge.on_pose(message, self.now_ns)
+        elif isinstance(message, Target):
+            self._target = Seen(message, self.now_ns)
+        else:
+            self._trees = Seen(message, self.now_ns)
+
+    def _run_bridge(self) -> None:
+        while (data := self._link.receive()) is not None:
+            if self.bridge_alive:
+                for message, received_ns in self.codec.take(data, self._link.send):
+                    self.bridge.handle(message, received_ns)
+        if not self.bridge_alive:
+            return
+        for message in self.bridge.tick(self.now_ns):
+            if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED":
+                self.setpoints.append((self.now_ns, message))
+            self._link.send(self.codec.pack(message))
+        if self._ticks % 5 == 0:
+            self._vehicle = Seen(self.bridge.state(self.now_ns), self.now_ns)
+
+    def _run_mission(self) -> None:
+        services = {name: self.now_ns for name in _SERVICES if name not in self.silent}
+        inputs = Inputs(self.now_ns, self._pose, self._trees, self._target, self._vehicle, services)
+        self.outputs = self.mission.step(inputs)
+        self.events.extend(self.outputs.events)
+        for event in self.outputs.events:
+            if event.after == "docked":
+                self.dock_errors.append(self._docked_truth())
+        if self.bridge_alive:
+            self.bridge.on_guidance(self.outputs.guidance, self.now_ns)
+
+    # -- truth --------------------------------------------------------------------------------------------------
+    def _camera(self) -> Matrix:
+        return self.px4.true_pose() @ self.bridge.mount.T_body_camera
+
+    def _judge(self) -> None:
+        p = self.px4.true_pose()[:2, 3]
+        clear = min(
+            (float(np.hypot(p[0] - t.x_m, p[1] - t.y_m)) - t.radius_m for t in self.case.trunks), default=np.inf
+        )
+        self.clearance_m = min(self.clearance_m, clear)
+        touching = clear < self.case.navigator.aircraft_radius_m
+        self.touches += int(touching and not self._touching)
+        self._touching = touching
+        target = self.mission.board.target_id
+        if target is not None and target < len(self.case.trunks):
+            T, trunk = self._camera(), self.case.trunks[target]
+            offset = np.array([trunk.x_m, trunk.y_m]) - T[:2, 3]
+            bearing = wrap_angle(float(np.arctan2(offset[1], offset[0])) - camera_yaw(T))
+            self._history = [*self._history[-299:], (float(np.linalg.norm(offset)), bearing)]
+        else:
+            self._history = []
+
+    def _docked_truth(self) -> tuple[float, float]:
+        distance, bearing = np.mean(self._history, axis=0)
+        return float(distance), float(bearing)
+
+
+def _flat(x_m: float, y_m: float) -> float:
+    del x_m, y_m
+    return 0.0
+
+
+def random_case(seed: int, clutter: int = 6, navigator: NavigatorConfig | None = None) -> FlightCase:
+    """Return a forest drawn from ``seed``: trunks 2..6 m around the start, some too thick, wind up to 2 m/s."""
+    rng = np.random.default_rng([seed, 77])
+    trunks: list[TrueTrunk] = []
+    while len(trunks) < clutter:
+        angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(2.2, 5.5)
+        x, y = float(distance * np.cos(angle)), float(distance * np.sin(angle))
+        if all(np.hypot(x - t.x_m, y - t.y_m) > 1.2 for t in trunks):
+            thick = len(trunks) > 1 and rng.random() < 0.2
+            radius = float(rng.uniform(0.25, 0.4) if thick else rng.uniform(0.05, 0.19))
+            trunks.append(TrueTrunk(x, y, radius, suitable=not thick))
+    wind = WindConfig(mean_m_s=float(rng.uniform(0.0, 1.5)), gust_m_s=float(rng.uniform(0.2, 0.8)))
+    return FlightCase(seed, tuple(trunks), wind=wind, navigator=navigator or NavigatorConfig())
