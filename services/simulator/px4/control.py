@@ -9,9 +9,10 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numba import njit
 
-from services.common.geometry import Matrix, wrap_angle
-from services.simulator.px4.frames import rotation_from_wxyz, yaw_from_wxyz
+from services.common.geometry import Matrix
+from services.simulator.px4.kernels import rotate_inverse, rotation_matrix
 from services.simulator.px4.params import Parameters
 
 GRAVITY_M_S2 = 9.80665
@@ -22,6 +23,10 @@ NAN3: tuple[float, float, float] = (math.nan, math.nan, math.nan)
 
 def _nan3() -> Matrix:
     return np.array(NAN3)
+
+
+def _zero_for_nan(values: Matrix) -> Matrix:
+    return np.where(np.isnan(values), 0.0, values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,15 +96,15 @@ class PositionController:
         """Return the thrust vector and yaw for ``setpoint``."""
         self.follow(velocity_m_s, dt_s)
         velocity_sp = self._velocity_setpoint(setpoint, position_m)
-        self.velocity_sp_m_s = np.nan_to_num(velocity_sp)
+        self.velocity_sp_m_s = _zero_for_nan(velocity_sp)
         error = velocity_sp - velocity_m_s
         controlled = np.isfinite(error)
-        wanted = np.nan_to_num(setpoint.acceleration_m_s2)
-        wanted = wanted + np.where(controlled, self._pid(np.nan_to_num(error)), 0.0)
+        wanted = _zero_for_nan(setpoint.acceleration_m_s2)
+        wanted = wanted + np.where(controlled, self._pid(_zero_for_nan(error)), 0.0)
         axis, thrust, saturated = self._thrust(wanted)
         gain = np.array([self._params["MPC_XY_VEL_I_ACC"]] * 2 + [self._params["MPC_Z_VEL_I_ACC"]])
         if not saturated:
-            self._integral += np.where(controlled, np.nan_to_num(error) * gain * dt_s, 0.0)
+            self._integral += np.where(controlled, _zero_for_nan(error) * gain * dt_s, 0.0)
             self._integral = np.clip(self._integral, -GRAVITY_M_S2, GRAVITY_M_S2)
         yaw = setpoint.yaw_rad if math.isfinite(setpoint.yaw_rad) else yaw_rad
         rate = setpoint.yaw_rate_rad_s if math.isfinite(setpoint.yaw_rate_rad_s) else 0.0
@@ -111,7 +116,7 @@ class PositionController:
         by_position = (setpoint.position_m - position_m) * gains
         feed = setpoint.velocity_m_s
         both_missing = np.isnan(by_position) & np.isnan(feed)
-        total = np.nan_to_num(by_position) + np.nan_to_num(feed)
+        total = _zero_for_nan(by_position) + _zero_for_nan(feed)
         speed, limit = float(np.hypot(total[0], total[1])), p["MPC_XY_VEL_MAX"]
         if speed > limit:
             total[:2] *= limit / speed
@@ -146,17 +151,37 @@ def attitude_rates(setpoint: AttitudeSetpoint, quaternion_wxyz: Matrix, params: 
     The tilt error is the rotation between the thrust axes, taken as twice the sine of half the angle, as in
     Brescianini, Hehn, D'Andrea, "Nonlinear quadrocopter attitude control" (2013).
     """
-    R = rotation_from_wxyz(quaternion_wxyz)
-    up_body = R.T @ setpoint.thrust_axis  # the wanted thrust axis seen from the body, whose own is (0, 0, -1)
-    axis = np.cross(np.array([0.0, 0.0, -1.0]), up_body)
-    sine = float(np.linalg.norm(axis))
-    angle = math.atan2(sine, -float(up_body[2]))
-    tilt = axis / sine * 2.0 * math.sin(0.5 * angle) if sine > 1e-9 else np.zeros(3)
-    yaw_error = 2.0 * math.sin(0.5 * wrap_angle(setpoint.yaw_rad - yaw_from_wxyz(quaternion_wxyz)))
-    limit = math.radians(params["MC_ROLLRATE_MAX"])
-    limit_yaw = math.radians(params["MC_YAWRATE_MAX"])
-    yaw_rate = params["MC_YAW_P"] * yaw_error + setpoint.yaw_rate_rad_s
-    rates = np.array([params["MC_ROLL_P"] * tilt[0], params["MC_PITCH_P"] * tilt[1], 0.0])
-    # a yaw rate is about the local vertical, the third body axis only when level
-    rates += R.T @ np.array([0.0, 0.0, min(max(yaw_rate, -limit_yaw), limit_yaw)])
-    return np.array([min(max(v, -limit), limit) for v in rates])
+    limit, limit_yaw = math.radians(params["MC_ROLLRATE_MAX"]), math.radians(params["MC_YAWRATE_MAX"])
+    gains = (params["MC_ROLL_P"], params["MC_PITCH_P"], params["MC_YAW_P"])
+    return _attitude_rates(
+        quaternion_wxyz, setpoint.thrust_axis, setpoint.yaw_rad, setpoint.yaw_rate_rad_s, gains, limit, limit_yaw
+    )
+
+
+@njit(cache=True, nogil=True)
+def _attitude_rates(
+    q: Matrix,
+    thrust_axis: Matrix,
+    yaw_rad: float,
+    yaw_rate_rad_s: float,
+    gains: tuple[float, float, float],
+    limit: float,
+    limit_yaw: float,
+) -> Matrix:
+    R = rotation_matrix(q)
+    up = rotate_inverse(q, thrust_axis)  # the wanted thrust axis seen from the body, whose own is (0, 0, -1)
+    sine = math.sqrt(up[0] ** 2 + up[1] ** 2)
+    angle = math.atan2(sine, -up[2])
+    scale = 2.0 * math.sin(0.5 * angle) / sine if sine > 1e-9 else 0.0
+    yaw = math.atan2(R[1, 0], R[0, 0])
+    error = (yaw_rad - yaw + math.pi) % (2.0 * math.pi) - math.pi
+    yaw_rate = gains[2] * 2.0 * math.sin(0.5 * error) + yaw_rate_rad_s
+    yaw_rate = min(max(yaw_rate, -limit_yaw), limit_yaw)
+    rates = np.empty(3)
+    # (0, 0, -1) x up, and a yaw rate that is about the local vertical, the third body axis only when level
+    rates[0] = gains[0] * scale * up[1] + R[2, 0] * yaw_rate
+    rates[1] = -gains[1] * scale * up[0] + R[2, 1] * yaw_rate
+    rates[2] = R[2, 2] * yaw_rate
+    for i in range(3):
+        rates[i] = min(max(rates[i], -limit), limit)
+    return rates

@@ -132,6 +132,10 @@ class Vehicle:
                 else np.zeros(3)
             )
 
+    def spin_once(self) -> None:
+        """Run the attitude loop once whatever the thrust (to compile it)."""
+        attitude_rates(self._attitude_sp, self.estimator.quaternion_wxyz, self.params)
+
     def _situation(self) -> Situation:
         e = self.estimator
         return Situation(

@@ -1,0 +1,62 @@
+"""The camera that rides on the simulated aircraft: a pose source for the simulator service."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from services.common.geometry import R_BODY_CAMERA, Matrix, pose
+from services.simulator.px4.frames import world_from_ned
+from services.simulator.px4.simulated import SimulatedPx4
+
+
+def body_camera(offset_m: tuple[float, float, float]) -> Matrix:
+    """Return ``T_body_camera`` of a camera that looks forward, ``offset_m`` (forward, left, up) from the body origin.
+
+    The same offset belongs in ``autopilot.camera_offset_m``: what differs is flown as an error.
+    """
+    return pose(R_BODY_CAMERA, offset_m)
+
+
+class FlyingCamera:
+    """Carries the camera where the autopilot flies. ``advance`` lets simulated time pass."""
+
+    scripted = False
+
+    def __init__(
+        self,
+        px4: SimulatedPx4,
+        offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        end_after_landing_s: float = 3.0,
+    ) -> None:
+        self.px4 = px4
+        self._T_body_camera = body_camera(offset_m)
+        self._end_after_landing_s = end_after_landing_s
+        self._acceleration = np.zeros(3)
+        self._flown = False
+        self._parked_s = 0.0
+
+    @property
+    def done(self) -> bool:
+        """Whether the flight is over: it has flown, stands, and has been disarmed for a while."""
+        return self._parked_s >= self._end_after_landing_s
+
+    def pose(self) -> Matrix:
+        """Return the true ``T_world_camera`` (4, 4) now."""
+        return self.px4.true_pose() @ self._T_body_camera
+
+    def acceleration(self) -> Matrix:
+        """Return the camera's mean acceleration (3,) over the last advance, world, m/s^2, gravity not included."""
+        return self._acceleration
+
+    def advance(self, dt_s: float) -> Matrix:
+        """Let ``dt_s`` pass and return ``T_world_camera``."""
+        before = self._velocity()
+        self.px4.step(dt_s)
+        self._acceleration = (self._velocity() - before) / dt_s
+        self._flown = self._flown or not self.px4.on_ground
+        parked = self._flown and self.px4.on_ground and not self.px4.armed
+        self._parked_s = self._parked_s + dt_s if parked else 0.0
+        return self.pose()
+
+    def _velocity(self) -> Matrix:
+        return world_from_ned(self.px4.vehicle.body.state[3:6].copy())
