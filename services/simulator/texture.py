@@ -16,6 +16,7 @@ GROUND, BARK, LEAF, WOOD, BACKDROP, CLOTH = range(6)
 LATTICE = 64
 """Side of the noise lattice; it repeats after that many cells."""
 _MASK = LATTICE - 1
+_ENTRIES = LATTICE**3 - 1
 
 _FAST = {"contract", "arcp", "nsz"}
 """Floating point freedoms that keep infinities and the order of sums."""
@@ -43,6 +44,14 @@ def palette() -> NDArray[np.float32]:
 def lattice(seed: int) -> NDArray[np.float32]:
     """Return random values 0..1 on the lattice, flat (LATTICE^3,)."""
     return np.random.default_rng([seed, 11]).random(LATTICE**3, dtype=np.float32)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _mixed(i: int, j: int, k: int) -> int:
+    """Return a number that looks random for each cell: unlike the lattice, flakes never repeat."""
+    h = (i * 73856093) ^ (j * 19349663) ^ (k * 83492791)
+    h ^= (h >> 13) & 0x7FFFF
+    return (h * 1540483477 & 0x7FFFFFFFFFFF) >> 8
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST, inline="always")
@@ -111,14 +120,15 @@ def _flake(
         return _ZERO
     sx, sy, sz = x / size, y / size + np.float32(0.37) * x / size, z / tall
     fx, fy, fz = np.floor(sx), np.floor(sy), np.floor(sz)
-    i, j, k = int(fx), int(fy), int(fz)
-    pick = _at(table, i, j, k)
+    mixed = _mixed(int(fx), int(fy), int(fz))
+    pick = table[mixed & _ENTRIES]
     if pick >= share:
         return _ZERO
-    turn = np.float32(2.0) * _at(table, j, k, i + 31) - _ONE
+    turn = np.float32(2.0) * table[(mixed >> 7) & _ENTRIES] - _ONE
     norm = _ONE / (_ONE + turn * turn)
     cosine, sine = (_ONE - turn * turn) * norm, np.float32(2.0) * turn * norm
-    a, b, c = sx - fx - _HALF, sy - fy - _HALF, sz - fz - _HALF
+    aside = np.float32(0.24) * table[(mixed >> 3) & _ENTRIES] - np.float32(0.12)
+    a, b, c = sx - fx - _HALF - aside, sy - fy - _HALF + aside, sz - fz - _HALF
     along, across = cosine * a + sine * b, cosine * b - sine * a
     radius = np.sqrt(np.float32(5.0) * along * along + np.float32(14.0) * across * across + np.float32(4.0) * c * c)
     edge = (_ONE - radius) * size / (np.float32(3.0) * pixel_m)
