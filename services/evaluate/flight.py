@@ -1,5 +1,6 @@
-"""One flight without rendering: simulated PX4, bridge, mission and the synthetic chain, in one thread and simulated
-time. Faster than real time, the same every time.
+"""One flight without rendering: simulated PX4, bridge, mission and the synthetic chain in simulated time.
+
+One thread, faster than real time, the same every time.
 """
 
 from __future__ import annotations

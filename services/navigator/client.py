@@ -1,0 +1,34 @@
+"""How anybody commands the aircraft: ask it for a nonce, then send the command with it."""
+
+from __future__ import annotations
+
+from typing import Protocol, TypeVar
+
+from schemas.codec import Wire
+from schemas.command import Command, CommandName, CommandReply, NonceReply, NonceRequest
+from schemas.topics import COMMAND, COMMAND_NONCE, Topic
+
+A = TypeVar("A", bound=Wire)
+
+
+class Asker(Protocol):
+    """A bus or a service's context: what can query a key."""
+
+    def ask(
+        self, topic: Topic, request: Wire | None, kind: type[A], timeout_s: float, leaf: str | None = None
+    ) -> list[A]:
+        """Query a key and return the decoded replies; empty when nobody answered in time."""
+        ...
+
+
+def send_command(
+    asker: Asker, name: CommandName, tree_id: int | None = None, sender: str = "operator", timeout_s: float = 2.0
+) -> CommandReply | None:
+    """Command the aircraft and return its reply, or None when no navigator answered within ``timeout_s``, twice."""
+    nonces = asker.ask(COMMAND_NONCE, NonceRequest(sender=sender), NonceReply, timeout_s)
+    if not nonces:
+        return None
+    fresh = nonces[0]
+    command = Command(name=name, sender=sender, nonce=fresh.nonce, sequence=fresh.next_sequence, tree_id=tree_id)
+    replies = asker.ask(COMMAND, command, CommandReply, timeout_s, leaf=name)
+    return replies[0] if replies else None

@@ -1,0 +1,120 @@
+"""Commands: fresh by a nonce of the aircraft, in order, at most once; each refusal says why."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import pytest
+
+from schemas.command import Command, CommandReply, NonceReply
+from schemas.navigation import Guidance, MissionState
+from schemas.topics import COMMAND, MISSION_GUIDANCE, MISSION_STATE
+from services.common.config import TreedockConfig
+from services.common.context import Context
+from services.common.memory import Hub, MemoryContext
+from services.navigator.client import send_command
+from services.navigator.commands import CommandDesk
+from services.navigator.service import build
+
+SECOND = 1_000_000_000
+
+
+def _desk() -> CommandDesk:
+    numbers = iter(range(1, 1000))
+    return CommandDesk(5.0, lambda: next(numbers).to_bytes(16, "big"))
+
+
+def _command(reply: NonceReply, sequence: int | None = None, **changes: Any) -> Command:
+    values: dict[str, Any] = {"name": "hold", "sender": "ground", "nonce": reply.nonce}
+    values["sequence"] = reply.next_sequence if sequence is None else sequence
+    return Command(**{**values, **changes})
+
+
+def test_fresh_command_is_taken_once() -> None:
+    desk = _desk()
+    fresh = desk.issue("ground", 0)
+    command = _command(fresh)
+    assert desk.refusal(command, SECOND) == ""
+    assert "replayed" in desk.refusal(command, SECOND)
+    assert desk.refusal(_command(fresh, fresh.next_sequence + 5), SECOND) == ""
+    assert "replayed" in desk.refusal(_command(fresh, fresh.next_sequence + 5), SECOND)
+
+
+def test_stale_unknown_and_stolen_nonces_are_refused() -> None:
+    desk = _desk()
+    fresh = desk.issue("ground", 0)
+    assert "stale" in desk.refusal(_command(fresh), 5 * SECOND + 1)
+    assert "unknown" in desk.refusal(_command(fresh, nonce=b"\0" * 16), 0)
+    assert "another sender" in desk.refusal(_command(fresh, sender="other"), 0)
+    assert desk.refusal(_command(fresh), 5 * SECOND) == ""
+
+
+def test_a_command_recorded_in_an_earlier_exchange_is_worth_nothing() -> None:
+    desk = _desk()
+    old = _command(desk.issue("ground", 0))
+    assert desk.refusal(old, 1) == ""
+    desk.issue("ground", 4 * SECOND)
+    assert desk.refusal(old, 4 * SECOND) != ""
+
+
+def test_sequences_rise_over_all_nonces() -> None:
+    desk = _desk()
+    first = desk.issue("ground", 0)
+    assert desk.refusal(_command(first, 41), 0) == ""
+    assert desk.issue("ground", 0).next_sequence == 42
+
+
+def test_many_nonces_neither_grow_memory_nor_evict_other_senders_fresh_ones() -> None:
+    desk = _desk()
+    mine = desk.issue("ground", 0)
+    for _ in range(500):
+        desk.issue("flood", 0)
+    assert desk.refusal(_command(mine), 0) == ""
+
+
+@pytest.fixture
+def hub() -> Hub:
+    hub = Hub(TreedockConfig())
+    hub.clock.set_ns(SECOND)
+    build(cast("Context", hub.context("navigator")))
+    return hub
+
+
+def test_the_navigator_answers_with_its_reason(hub: Hub) -> None:
+    client = hub.context("station")
+    reply = send_command(client, "start")
+    assert reply is not None
+    assert not reply.accepted
+    assert "autopilot" in reply.reason
+    reply = send_command(client, "land")
+    assert reply is not None
+    assert not reply.accepted
+    assert reply.state == "idle"
+
+
+def test_the_key_and_the_name_must_agree(hub: Hub) -> None:
+    client: MemoryContext = hub.context("station")
+    from schemas.command import NonceRequest
+    from schemas.topics import COMMAND_NONCE
+
+    nonce = client.ask(COMMAND_NONCE, NonceRequest(sender="ground"), NonceReply, 1.0)[0]
+    replies = client.ask(COMMAND, _command(nonce, name="land"), CommandReply, 1.0, leaf="hold")
+    assert not replies[0].accepted
+    assert "cmd/hold" in replies[0].reason
+
+
+def test_guidance_and_state_flow_from_the_first_moment(hub: Hub) -> None:
+    guidance: list[Guidance] = []
+    states: list[MissionState] = []
+    client = hub.context("station")
+    client.on(MISSION_GUIDANCE, guidance.append)
+    client.on(MISSION_STATE, states.append)
+    hub.advance_to(3 * SECOND)
+    assert len(guidance) == pytest.approx(40, abs=1)
+    assert len(states) == pytest.approx(10, abs=1)
+    assert not any(g.engage for g in guidance)
+    assert states[-1].state == "idle"
+
+
+def test_a_lost_answer_is_told_as_none() -> None:
+    assert send_command(Hub(TreedockConfig()).context("station"), "hold") is None
