@@ -11,6 +11,7 @@ from services.camera.config import CameraConfig
 from services.cli.run_config import SupervisorConfig
 from services.detector.config import DetectorServiceConfig
 from services.detector.refine.config import RefinerConfig
+from services.navigator.autopilot.config import AutopilotConfig
 from services.navigator.config import NavigatorConfig
 from services.router.config import RouterConfig
 from services.simulator.config import SimulatorConfig
@@ -35,6 +36,7 @@ class TreedockConfig(BaseModel):
     refiner: RefinerConfig = RefinerConfig()
     simulator: SimulatorConfig = SimulatorConfig()
     navigator: NavigatorConfig = Field(default_factory=NavigatorConfig)
+    autopilot: AutopilotConfig = Field(default_factory=AutopilotConfig)
 
 
 def load_config(file: Path | None = None) -> TreedockConfig:
