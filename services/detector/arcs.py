@@ -21,6 +21,8 @@ from services.detector.voxels import Voxels
 RIM = 0.92
 """Share of the radius beyond which the ray residual is continued linearly."""
 _COLUMNS = 11
+_MOST = 240
+"""Points of one circle that its fit uses at most; the joint fit of the trunk uses more."""
 BINS = 36
 """Bins of the arc coverage, 10 degrees each."""
 
@@ -132,7 +134,7 @@ def _seed(
         for _ in range(10):
             q = left[min(n - 1, int(_uniform(state) * n))]
             d2 = (P[q, 0] - P[i, 0]) ** 2 + (P[q, 1] - P[i, 1]) ** 2
-            if q == i or q == j or d2 > 4.0 * r_max * r_max:
+            if q in (i, j) or d2 > 4.0 * r_max * r_max:
                 continue
             if j < 0:
                 j = q
@@ -174,63 +176,81 @@ def solve(A: Floats, y: Floats, x: Floats) -> None:
 
 
 @njit(cache=True, nogil=True)
+def _neighbourhood(P: Floats, S: Floats, left: Ints, n: int, c: Floats, near: Ints) -> int:
+    """List at most ``len(near)`` evenly taken points that the circle ``c`` might reach in the fit."""
+    found = 0
+    for q in range(n):
+        i = left[q]
+        d = np.sqrt((P[i, 0] - c[0]) ** 2 + (P[i, 1] - c[1]) ** 2)
+        found += 1 if abs(d - c[2]) < 0.05 + 0.3 * c[2] + 2.0 * S[i] else 0
+    every = 1 + (found - 1) // near.shape[0] if found > 0 else 1
+    seen, m = 0, 0
+    for q in range(n):
+        i = left[q]
+        d = np.sqrt((P[i, 0] - c[0]) ** 2 + (P[i, 1] - c[1]) ** 2)
+        if abs(d - c[2]) < 0.05 + 0.3 * c[2] + 2.0 * S[i]:
+            if seen % every == 0 and m < near.shape[0]:
+                near[m] = i
+                m += 1
+            seen += 1
+    return m
+
+
+@njit(cache=True, nogil=True)
+def _normal_step(
+    P: Floats, U: Floats, near: Ints, m: int, c: Floats, e: Floats, sigma: Floats, scale: float, x: Floats
+) -> None:
+    """Write the Gauss-Newton step of the circle to ``x`` (Tukey weights, a little damping)."""
+    J, A, y = np.empty(3), np.zeros((3, 3)), np.zeros(3)
+    for q in range(m):
+        t = e[q] / (4.0 * scale)
+        if abs(t) >= 1.0:
+            continue
+        i = near[q]
+        residual(P[i, 0], P[i, 1], U[i, 0], U[i, 1], c[0], c[1], c[2], J)
+        w = (1.0 - t * t) ** 2
+        for a in range(3):
+            y[a] -= w * e[q] * J[a] / sigma[q]
+            for b in range(3):
+                A[a, b] += w * J[a] * J[b] / (sigma[q] * sigma[q])
+    for a in range(3):
+        A[a, a] *= 1.0 + 1e-3
+        A[a, a] += 1e-6
+    solve(A, y, x)
+
+
+@njit(cache=True, nogil=True)
 def _refine(
-    P: Floats,
-    U: Floats,
-    G: Floats,
-    left: Ints,
-    n: int,
-    c: Floats,
-    k_range: float,
-    surface: float,
-    r_min: float,
-    r_max: float,
-) -> float:
+    P: Floats, U: Floats, G: Floats, near: Ints, m: int, c: Floats, k_range: float, surface: float, r_min: float, r_max: float
+) -> float:  # fmt: skip
     """Fit the circle ``c`` robustly (Gauss-Newton, Tukey weights on normalised residuals); return the scale factor.
 
     The scale factor multiplies the expected noise of each point to give the observed one.
     """
-    J, A, y, x = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty(3)
-    e, sigma = np.empty(n), np.empty(n)
+    J, x = np.empty(3), np.empty(3)
+    e, sigma, size = np.empty(m), np.empty(m), np.empty(m)
     scale = 3.0
-    for iteration in range(12):
-        near = 0
-        size = np.empty(n)
-        for q in range(n):
-            i = left[q]
+    for _ in range(8):
+        held = 0
+        for q in range(m):
+            i = near[q]
             ray = U[i, 0] != 0.0 or U[i, 1] != 0.0
             s = ((c[0] - P[i, 0]) * U[i, 1] - (c[1] - P[i, 1]) * U[i, 0]) / c[2]
             sigma[q] = point_sigma(s, G[i], ray, k_range, surface)
             e[q] = residual(P[i, 0], P[i, 1], U[i, 0], U[i, 1], c[0], c[1], c[2], J) / sigma[q]
             if abs(e[q]) < 4.5 * scale:
-                size[near] = abs(e[q])
-                near += 1
-        if near < 4:
+                size[held] = abs(e[q])
+                held += 1
+        if held < 4:
             return -1.0
-        scale = max(1.0, 1.4826 * np.median(size[:near]))
-        A[:] = 0.0
-        y[:] = 0.0
-        for q in range(n):
-            t = e[q] / (4.0 * scale)
-            if abs(t) >= 1.0:
-                continue
-            i = left[q]
-            residual(P[i, 0], P[i, 1], U[i, 0], U[i, 1], c[0], c[1], c[2], J)
-            w = (1.0 - t * t) ** 2
-            for a in range(3):
-                y[a] -= w * e[q] * J[a] / sigma[q]
-                for b in range(3):
-                    A[a, b] += w * J[a] * J[b] / (sigma[q] * sigma[q])
-        for a in range(3):
-            A[a, a] *= 1.0 + 1e-3
-            A[a, a] += 1e-6
-        solve(A, y, x)
+        scale = max(1.0, 1.4826 * np.median(size[:held]))
+        _normal_step(P, U, near, m, c, e, sigma, scale, x)
         step = np.sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2)
         limit = min(1.0, 0.5 * c[2] / max(step, 1e-12))
         for a in range(3):
             c[a] += limit * x[a]
         c[2] = min(max(c[2], 0.5 * r_min), 1.5 * r_max)
-        if step < 1e-5:
+        if step < 1e-4:
             break
     return scale
 
@@ -284,6 +304,7 @@ def _all_slices(
         largest = max(largest, begin[c + 1] - begin[c])
     P, U, G, S = np.empty((largest, 3)), np.empty((largest, 2)), np.empty(largest), np.empty(largest)
     left, taken = np.empty(largest, dtype=np.int64), np.empty(largest, dtype=np.int64)
+    near = np.empty(_MOST, dtype=np.int64)
     circle = np.empty(3)
     state = np.empty(1, dtype=np.int64)
     for c in range(begin.shape[0] - 1):
@@ -308,7 +329,8 @@ def _all_slices(
             tries = trials if first < 400 else 2 * trials
             if _seed(P, U, S, left, n, state, tries, r_min, r_max, circle) < 0.5 * min_points:
                 break
-            scale = _refine(P, U, G, left, n, circle, k_range, surface, r_min, r_max)
+            m = _neighbourhood(P, S, left, n, circle, near)
+            scale = _refine(P, U, G, near, m, circle, k_range, surface, r_min, r_max)
             if scale < 0.0:
                 break
             on = _judge(P, U, G, left, n, circle, scale, k_range, surface, out[rows], taken)

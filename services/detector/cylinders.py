@@ -24,6 +24,8 @@ _PRIOR_SLOPE = 0.02
 _PRIOR_TAPER = 0.008
 """Standard deviation of the taper about its mean, metres of radius per metre of height."""
 _MEAN_TAPER = -0.006
+_MOST = (1500, 5000)
+"""Points that the first and the second turn of a fit use at most."""
 _CORRELATED = 25.0
 """Neighbouring points share fixed-pattern noise and bark: so many of them count as one in the covariance."""
 
@@ -200,14 +202,15 @@ def fit_cylinder(voxels: Voxels, stack: Stack, config: DetectorConfig) -> Cylind
         if n < 15:
             return None
         R = rotation_aligning((slope[0], slope[1], 1.0), (0.0, 0.0, 1.0))
-        P, U, G = _axis_frame(voxels, buffer[:n], at, R)
+        every = 1 + n // _MOST[turn]
+        P, U, G = _axis_frame(voxels, buffer[:n:every], at, R)
         mean_taper = _MEAN_TAPER
         x[:] = (0.0, 0.0, 0.0, 0.0, radius, mean_taper if turn == 0 else x[5])
         prior = np.array([
             [0.0, 1e-6], [0.0, 1e-6], [0.0, 1.0 / (4 * _PRIOR_SLOPE) ** 2], [0.0, 1.0 / (4 * _PRIOR_SLOPE) ** 2],
             [radius, 1e-6], [mean_taper, 1.0 / _PRIOR_TAPER**2],
         ])  # fmt: skip
-        W = np.full(n, 1.0 / _CORRELATED)
+        W = np.full(len(P), every / _CORRELATED)
         scale = float(
             _fit(P, U, G, W, x, config.range_noise_per_m, config.surface_noise_m, 3.0 if turn == 0 else scale, prior, normal)
         )  # fmt: skip
