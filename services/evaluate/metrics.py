@@ -46,6 +46,7 @@ def metrics(result: OfflineResult) -> dict[str, Any]:
         "trees_suitable": sum(tree.suitable for tree in result.trees),
         "cloud_points": len(result.points_m),
         "targets_measured": sum(target.measured for target in result.targets),
+        "setup_s": round(result.setup_s, 3),
         "duration_s": round(result.duration_s, 3),
         "ms": {name: summary_ms(durations) for name, durations in result.stage_ms.items()},
         "counters": result.counters,

@@ -67,7 +67,10 @@ class OfflineResult:
     stage_ms: dict[str, list[float]]
     """Durations of each service's stages and, as ``frame``, of the whole chain per frame."""
     counters: dict[str, int]
+    setup_s: float
+    """Importing the services and loading (on a machine's first run: compiling) their kernels."""
     duration_s: float
+    """Of all, with the set-up."""
 
 
 def default_builders() -> dict[str, Builder]:
@@ -84,11 +87,14 @@ def default_builders() -> dict[str, Builder]:
 class Chain:
     """The services of the chain on one hub, and what they said."""
 
-    def __init__(self, config: TreedockConfig, builders: Mapping[str, Builder], start_ns: int) -> None:
+    def __init__(self, config: TreedockConfig, builders: Mapping[str, Builder] | None, start_ns: int) -> None:
+        self._begin_s = time.perf_counter()
+        builders = default_builders() if builders is None else builders
         self._hub = Hub(config, SimulatedClock(start_ns), config.uav)
         self._contexts: dict[str, MemoryContext] = {name: self._hub.context(name) for name in builders}
         # mypy: the protocol's clock is writable, so it wants exactly Clock
         self._services = {name: build(cast("Context", self._contexts[name])) for name, build in builders.items()}
+        self._setup_s = time.perf_counter() - self._begin_s
         self._camera = self._hub.context("camera")
         self._frame_ms: list[float] = []
         self._online: list[Stamped] = []
@@ -107,7 +113,7 @@ class Chain:
         self._frame_ms.append((time.perf_counter() - begin) * 1e3)
         self.counts.frames += 1
 
-    def result(self, duration_s: float) -> OfflineResult:
+    def result(self) -> OfflineResult:
         """Let the chain come to rest and collect the final estimates; a service left out contributes nothing."""
         self._hub.advance_to(self._hub.clock.now_ns() + round(SETTLE_S * 1e9))
         slam, mapper, detector = (self._services.get(name) for name in ("slam", "mapper", "detector"))
@@ -123,7 +129,8 @@ class Chain:
             targets=self._targets,
             stage_ms=self._stages(),
             counters=self._counters(),
-            duration_s=duration_s,
+            setup_s=self._setup_s,
+            duration_s=time.perf_counter() - self._begin_s,
         )
 
     def _on_pose(self, pose: Pose) -> None:
@@ -168,7 +175,6 @@ def run_offline(
     Raises:
         InputError: a bad frame (unless skipped), or no good frame at all.
     """
-    begin = time.perf_counter()
     skipped: list[str] = []
     good = _good(frames, skipped, skip_bad_frames=skip_bad_frames)
     first = next(good, None)
@@ -176,13 +182,13 @@ def run_offline(
         raise InputError(
             f"no usable frame among {len(skipped)}: {skipped[0]}" if skipped else "the source has no frames"
         )
-    chain = Chain(config, builders if builders is not None else default_builders(), first.stamp_ns)
+    chain = Chain(config, builders, first.stamp_ns)
     chain.counts.skipped = skipped
     for frame in itertools.chain([first], good):
         chain.feed(frame)
         if progress is not None:
             progress(chain.counts)
-    return chain.result(time.perf_counter() - begin)
+    return chain.result()
 
 
 def _good(frames: Iterable[RgbdFrame | BadFrame], skipped: list[str], *, skip_bad_frames: bool) -> Iterator[RgbdFrame]:
