@@ -8,8 +8,8 @@ from __future__ import annotations
 import importlib
 import sys
 from importlib.util import find_spec
+from typing import Any
 
-import click
 import typer
 
 from services.cli.config_command import config
@@ -23,6 +23,9 @@ COMMAND_MODULES = ("process", "detect", "simulate", "catalogue", "bench", "warm"
 """Modules beside this one that hold one command of the same name each."""
 
 EXIT_DONE, EXIT_BUG, EXIT_INPUT, EXIT_NO_GOAL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
+
+_USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
+"""UsageError of the click inside this typer: newer ones carry their own, so `import click` gives another class."""
 
 
 def make_app() -> typer.Typer:
@@ -60,12 +63,13 @@ def invoke(arguments: list[str]) -> int:
         return _tell(str(error), EXIT_INPUT)
     except GoalNotReachedError as error:
         return _tell(str(error), EXIT_NO_GOAL)
-    except click.UsageError as error:
-        where = f" (see `{error.ctx.command_path} --help`)" if error.ctx else ""
+    except _USAGE_ERROR as error:
+        context = getattr(error, "ctx", None)
+        where = f" (see `{context.command_path} --help`)" if context else ""
         return _tell(f"{error.format_message()}{where}", EXIT_INPUT)
-    except click.exceptions.Exit as stop:
+    except typer.Exit as stop:
         return stop.exit_code
-    except (KeyboardInterrupt, click.Abort):
+    except (KeyboardInterrupt, typer.Abort):
         return EXIT_INTERRUPTED
     except BrokenPipeError:  # the reader of our output went away: `treedock topic echo ... | head`
         sys.stderr.close()
