@@ -90,6 +90,7 @@ class Companion:
 
     def send(self, message: Any) -> None:
         self.link.send(message.pack(self.mav))
+        self.mav.seq = (self.mav.seq + 1) % 256
 
     def run(self, seconds: float, each_tick: Callable[[], None] | None = None) -> None:
         for _ in range(round(seconds / TICK_S)):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from services.common.geometry import Matrix, wrap_angle
 from services.simulator.px4.estimator_kernels import STATES, fuse, innovation_variance, predict, replay, yaw_row
 from services.simulator.px4.frames import rotation_from_wxyz, yaw_from_wxyz
 from services.simulator.px4.params import Parameters
+from services.simulator.px4.vision import EV_HPOS, EV_VEL, EV_VPOS, EV_YAW, VisionFlags, VisionSample
 
 EV_MAX_INTERVAL_S = 0.2
 """Fusion starts only on samples closer than this, and stops after twice this without one."""
@@ -27,34 +27,6 @@ _FAKE_SPEED_M_S = 2.0
 _QUEUE = 30
 _BARO_SIGMA_M = 0.5
 _YAW_VARIANCE_START = 0.5
-EV_HPOS, EV_VPOS, EV_VEL, EV_YAW = 1, 2, 4, 8
-"""Bits of EKF2_EV_CTRL."""
-
-
-@dataclass(frozen=True, slots=True)
-class VisionSample:
-    """One accepted ODOMETRY message in the estimator's time and axes. NaN means: not told."""
-
-    stamp_s: float
-    position_m: Matrix
-    quaternion_wxyz: Matrix
-    velocity_body_m_s: Matrix
-    position_var: Matrix
-    yaw_var: float
-    velocity_var: Matrix
-    frame_is_ned: bool
-    reset_counter: int
-    quality: int = 0
-
-
-@dataclass(slots=True)
-class VisionFlags:
-    """What of the vision is being fused."""
-
-    position: bool = False
-    height: bool = False
-    yaw: bool = False
-    velocity: bool = False
 
 
 class Estimator:

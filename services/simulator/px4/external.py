@@ -9,8 +9,8 @@ from pymavlink.dialects.v20 import common as m
 
 from services.common.geometry import Matrix, rotation_z
 from services.simulator.px4.control import Setpoint
-from services.simulator.px4.estimator import VisionSample
 from services.simulator.px4.telemetry import Message
+from services.simulator.px4.vision import VisionSample
 
 QUATERNION_NORM_TOLERANCE = 1e-5
 _VISION_TYPES = {

@@ -42,6 +42,7 @@ class Port:
     def send(self, message: Message) -> None:
         """Pack with this link's sequence number and send."""
         self.link.send(message.pack(self.mav))
+        self.mav.seq = (self.mav.seq + 1) % 256
 
     def set_interval(self, ident: int, interval_us: float, now_s: float) -> bool:
         """Set a stream's interval: -1 stops it, 0 restores its default; False for a message we do not have."""

@@ -182,8 +182,8 @@ class Vehicle:
             self._controller.follow(estimate.velocity_m_s, dt_s)
             self._thrust_m_s2 = 0.0
             return
-        if self.land.landed:
-            self._controller.reset()
+        if self.land.ramp < 1.0:
+            self._controller.reset()  # thrust is held back: the integrator must not wind up
         self._attitude_sp = self._controller.update(
             wanted, estimate.position_m, estimate.velocity_m_s, estimate.yaw_rad, dt_s
         )

@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from services.simulator.px4.config import Px4Config
-from services.simulator.px4.estimator import VisionSample
 from services.simulator.px4.vehicle import Vehicle
+from services.simulator.px4.vision import VisionSample
 
 
 def warm() -> None:
