@@ -144,6 +144,15 @@ class Atlas:
         observe_all(self.points, kf, k, point)
         return k
 
+    def features_of(self, k: int) -> Features:
+        """Return a keyframe's features as they were extracted."""
+        kf, n = self.keyframes, int(self.keyframes.n[k])
+        return Features(
+            kf.uv[k, :n].astype(float), kf.octave[k, :n].copy(), kf.angle[k, :n].astype(float), kf.desc[k, :n].copy(),
+            kf.depth[k, :n].astype(float), kf.disparity[k, :n].astype(float), kf.cell_start[k].copy(),
+            kf.cell_items[k, :n].copy(),
+        )  # fmt: skip
+
     def slot_of(self, serial: int) -> int:
         """Return the slot of a living keyframe, or -1."""
         where = np.flatnonzero((self.keyframes.serial == serial) & (self.keyframes.n > 0))

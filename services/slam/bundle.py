@@ -169,61 +169,85 @@ def eliminate_point(problem: Problem, m: int, free: int, S: F64, g: F64, W: F64,
                     S[6 * k + a, 6 * j + b] -= Y[a, 0] * W[q, b, 0] + Y[a, 1] * W[q, b, 1] + Y[a, 2] * W[q, b, 2]
 
 
+class Workspace(NamedTuple):
+    """What one linearisation leaves for the back substitution."""
+
+    S: F64
+    """(6 free, 6 free) reduced camera system, lower triangle."""
+    W: F64
+    """(O, 6, 3) camera-point blocks."""
+    Hi: F64
+    """(M, 3, 3) inverse point blocks."""
+    bp: F64
+    dc: F64
+    """(6 free,) right hand side, then the cameras' step."""
+    dX: F64
+
+
 @njit(cache=True, nogil=True)
-def solve_step(
-    problem: Problem, camera: F64, free: int, robust: bool, damping: float, W: F64, dc: F64, dX: F64
-) -> bool:
-    """Fill the damped step of cameras ``dc`` (6 * free) and points ``dX`` (M, 3); False when the system is singular."""
+def workspace(problem: Problem, free: int) -> Workspace:
+    """Return the arrays an adjustment needs."""
     n, M = 6 * free, len(problem.X)
-    S = np.zeros((n, n))
+    return Workspace(
+        np.zeros((n, n)), np.zeros((len(problem.pose), 6, 3)), np.zeros((M, 3, 3)), np.zeros((M, 3)), np.zeros(n),
+        np.zeros((M, 3)),
+    )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def reduce_system(problem: Problem, camera: F64, free: int, robust: bool, damping: float, work: Workspace) -> None:
+    """Fill the damped reduced camera system: ``S`` and, as its right hand side, ``dc``."""
+    S, dc = work.S, work.dc
+    S[:] = 0.0
     dc[:] = 0.0
-    Hp, Hi, bp = np.empty((3, 3)), np.empty((M, 3, 3)), np.empty((M, 3))
-    D = np.empty(n)
-    for m in range(M):
-        linearise_point(problem, camera, m, robust, free, S, dc, W, Hp, bp[m])
-        invert3(Hp, damping, Hi[m])
-    for a in range(n):
+    Hp = np.empty((3, 3))
+    D = np.empty(len(dc))
+    for m in range(len(problem.X)):
+        linearise_point(problem, camera, m, robust, free, S, dc, work.W, Hp, work.bp[m])
+        invert3(Hp, damping, work.Hi[m])
+    for a in range(len(dc)):
         D[a] = damping * S[a, a] + 1e-9
-    for m in range(M):
-        eliminate_point(problem, m, free, S, dc, W, Hi[m], bp[m])
-    for a in range(n):
+    for m in range(len(problem.X)):
+        eliminate_point(problem, m, free, S, dc, work.W, work.Hi[m], work.bp[m])
+    for a in range(len(dc)):
         S[a, a] += D[a]
-    if n > 0 and not cholesky_solve(S, dc):
-        return False
-    for m in range(M):
-        b0, b1, b2 = bp[m, 0], bp[m, 1], bp[m, 2]
+
+
+@njit(cache=True, nogil=True)
+def move(problem: Problem, free: int, work: Workspace) -> None:
+    """Back-substitute the points' step from the cameras' ``dc`` and move both."""
+    for m in range(len(problem.X)):
+        b0, b1, b2 = work.bp[m, 0], work.bp[m, 1], work.bp[m, 2]
         for o in range(problem.start[m], problem.start[m + 1]):
             k = problem.pose[o]
             if k < free and problem.use[o]:
                 for a in range(6):
-                    b0 -= W[o, a, 0] * dc[6 * k + a]
-                    b1 -= W[o, a, 1] * dc[6 * k + a]
-                    b2 -= W[o, a, 2] * dc[6 * k + a]
+                    b0 -= work.W[o, a, 0] * work.dc[6 * k + a]
+                    b1 -= work.W[o, a, 1] * work.dc[6 * k + a]
+                    b2 -= work.W[o, a, 2] * work.dc[6 * k + a]
+        H = work.Hi[m]
         for a in range(3):
-            dX[m, a] = Hi[m, a, 0] * b0 + Hi[m, a, 1] * b1 + Hi[m, a, 2] * b2
-    return True
+            problem.X[m, a] += H[a, 0] * b0 + H[a, 1] * b1 + H[a, 2] * b2
+    for k in range(free):
+        step_pose(problem.R[k], problem.t[k], work.dc[6 * k : 6 * k + 6])
 
 
 @njit(cache=True, nogil=True)
 def adjust(problem: Problem, camera: F64, free: int, iterations: int, robust: bool) -> float:
     """Minimise over the free poses and all points, in place; return the final cost."""
-    W = np.zeros((len(problem.pose), 6, 3))
-    dc, dX = np.zeros(6 * free), np.zeros((len(problem.X), 3))
+    work = workspace(problem, free)
     cost = total_cost(problem, camera, robust)
     damping = 1e-5
     for _ in range(iterations):
-        if not solve_step(problem, camera, free, robust, damping, W, dc, dX):
+        reduce_system(problem, camera, free, robust, damping, work)
+        if not cholesky_solve(work.S, work.dc):
             damping *= 100.0
             continue
         R, t, X = problem.R[:free].copy(), problem.t[:free].copy(), problem.X.copy()
-        for k in range(free):
-            step_pose(problem.R[k], problem.t[k], dc[6 * k : 6 * k + 6])
-        for m in range(len(X)):
-            for a in range(3):
-                problem.X[m, a] += dX[m, a]
+        move(problem, free, work)
         new = total_cost(problem, camera, robust)
-        if new < cost:
-            gain = (cost - new) / max(cost, 1e-300)
+        gain = (cost - new) / max(cost, 1e-300)
+        if gain > 0.0:
             cost = new
             damping = max(damping * 0.1, 1e-9)
             if gain < 1e-5:
@@ -234,6 +258,33 @@ def adjust(problem: Problem, camera: F64, free: int, iterations: int, robust: bo
             damping *= 10.0
             if damping > 1e6:
                 break
+    return cost
+
+
+def adjust_large(problem: Problem, camera: F64, free: int, iterations: int, robust: bool) -> float:
+    """Do the same as ``adjust`` with the cameras' system solved by LAPACK: for a map of many keyframes."""
+    work = workspace(problem, free)
+    cost = total_cost(problem, camera, robust)
+    damping = 1e-5
+    for _ in range(iterations):
+        reduce_system(problem, camera, free, robust, damping, work)
+        lower = np.tril(work.S)
+        try:
+            work.dc[:] = np.linalg.solve(lower + np.tril(lower, -1).T, work.dc)
+        except np.linalg.LinAlgError:
+            damping *= 100.0
+            continue
+        R, t, X = problem.R[:free].copy(), problem.t[:free].copy(), problem.X.copy()
+        move(problem, free, work)
+        new = total_cost(problem, camera, robust)
+        gain = (cost - new) / max(cost, 1e-300)
+        if gain > 0.0:
+            cost, damping = new, max(damping * 0.1, 1e-9)
+            if gain < 1e-5:
+                break
+        else:
+            problem.R[:free], problem.t[:free], problem.X[:] = R, t, X
+            damping *= 10.0
     return cost
 
 

@@ -22,7 +22,7 @@ from services.slam.atlas import (
     remove_point,
     shared_counts,
 )
-from services.slam.bundle import adjust, build, chi_squares
+from services.slam.bundle import adjust, adjust_large, build, chi_squares
 from services.slam.camera import CameraModel
 from services.slam.config import SlamConfig
 from services.slam.features import Features
@@ -35,6 +35,8 @@ I32 = NDArray[np.int32]
 
 MATCH_STRICT = 50
 """Hamming distance below which two descriptors are taken for one corner."""
+_COMPILED_KEYFRAMES = 24
+"""Above this the cameras' system is large enough to pay for LAPACK."""
 
 
 class Mapping:
@@ -76,16 +78,21 @@ class Mapping:
         self._recent = np.concatenate([self._recent, np.stack([slots[:made], born], axis=1)])
 
     def _fuse(self, k: int) -> None:
-        atlas, camera = self.atlas, self.camera
+        atlas = self.atlas
         near = neighbours(atlas, k, 10, 10)
         own = points_of(atlas.points, atlas.keyframes, np.array([k], np.int32))
         for other in near:
-            fuse(atlas.points, atlas.keyframes, int(other), own, camera.array, camera.variance, camera.disparity_info,
-                 atlas.scales, camera.cols, camera.width, camera.height)  # fmt: skip
-        theirs = points_of(atlas.points, atlas.keyframes, near)
-        fuse(atlas.points, atlas.keyframes, k, theirs, camera.array, camera.variance, camera.disparity_info,
-             atlas.scales, camera.cols, camera.width, camera.height)  # fmt: skip
+            self.fuse_into(int(other), own)
+        self.fuse_into(k, points_of(atlas.points, atlas.keyframes, near))
         describe_all(atlas.points, atlas.keyframes, k, atlas.scales)
+
+    def fuse_into(self, k: int, ids: I32) -> int:
+        """Find points ``ids`` among the features of keyframe ``k``; return how many were joined."""
+        atlas, camera = self.atlas, self.camera
+        return fuse(
+            atlas.points, atlas.keyframes, k, ids, camera.array, camera.variance, camera.disparity_info, atlas.scales,
+            camera.cols, camera.width, camera.height,
+        )  # fmt: skip
 
     def adjust_window(self, k: int) -> None:
         """Bundle adjustment of keyframe ``k``, its neighbours and all they see; observers outside hold still."""
@@ -116,9 +123,10 @@ class Mapping:
         index = np.full(len(kf.n), -1, np.int32)
         index[slots] = np.arange(len(slots))
         problem = build(atlas.points, kf, ids, slots, index, camera.variance, camera.disparity_info)
-        adjust(problem, camera.array, len(free), robust_iterations, robust=True)
+        solve = adjust if len(free) <= _COMPILED_KEYFRAMES else adjust_large
+        solve(problem, camera.array, len(free), robust_iterations, robust=True)
         gate(chi_squares(problem, camera.array), problem.info, 1.0, problem.use)
-        adjust(problem, camera.array, len(free), iterations, robust=False)
+        solve(problem, camera.array, len(free), iterations, robust=False)
         gate(chi_squares(problem, camera.array), problem.info, 1.0, problem.use)
         kf.R[free], kf.t[free] = problem.R[: len(free)], problem.t[: len(free)]
         atlas.points.pos[ids] = problem.X

@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 from schemas.camera import Intrinsics
 from schemas.slam import GraphReason, SlamStatus
 from services.common.geometry import inverse, orthonormal, pose
-from services.slam import gravity
+from services.slam import gravity, vocabulary
 from services.slam.atlas import Atlas, shared_counts
 from services.slam.camera import camera_model
 from services.slam.config import SlamConfig
 from services.slam.features import Extractor, Features
+from services.slam.loops import Loops
 from services.slam.mapping import Mapping
+from services.slam.places import Places
 from services.slam.results import GraphUpdate, NewKeyframe, TrackResult
 from services.slam.tracking import Tracked, Tracking
 
@@ -27,6 +29,9 @@ F64 = NDArray[np.float64]
 
 _MIN_START_POINTS = 100
 """Features with depth that a first keyframe needs."""
+_JUMP_M = 0.01
+_JUMP_RAD = 0.005
+"""A loop that moves the camera by more is told as a jump."""
 
 
 @dataclass(slots=True)
@@ -52,6 +57,7 @@ class Slam:
         self.atlas = Atlas(config.features, cells, config.scale, config.levels)
         self.mapping = Mapping(self.atlas, camera, config)
         self.tracking = Tracking(self.atlas, camera, config)
+        self.loops = Loops(self.mapping, self.tracking, Places(vocabulary.load()), config)
         self.reset_counter = 0
         self.graph_version = 0
         self.up_sigma_rad = gravity.SIGMA_UNKNOWN_RAD
@@ -81,6 +87,8 @@ class Slam:
         if self.graph_version == 0:
             return self._initialise(stamp_ns, features, accel_camera, attitude_up_camera)
         frame = self._locate(features)
+        if frame is None and self.config.relocalise:
+            frame = self._relocalise(features)
         if frame is None:
             return self._lost(stamp_ns)
         return self._accept(stamp_ns, frame)
@@ -113,28 +121,49 @@ class Slam:
             return None
         return joined[0]
 
+    def _relocalise(self, features: Features) -> Tracked | None:
+        """Return the frame located anywhere in the map; that is a jump, and told as one."""
+        frame = self.loops.relocate(features)
+        if frame is not None:
+            self._last = None
+            self._step = np.eye(4)
+            self._count_reset()
+        return frame
+
+    def _count_reset(self) -> None:
+        self.reset_counter = (self.reset_counter + 1) % 256
+
     def _accept(self, stamp_ns: int, frame: Tracked) -> TrackResult:
         """Remember a frame that has its pose, and make a keyframe of it when the map needs one."""
-        new: list[NewKeyframe] = []
-        graph = None
         if self._last is not None:
             self._step = pose(frame.R, frame.t) @ inverse(pose(self._last.R, self._last.t))
+        new: list[NewKeyframe] = []
+        graph = None
         self._since_keyframe += 1
         if self._needs_keyframe(frame):
-            k = self.mapping.insert(frame.features, frame.R, frame.t, frame.point)
-            kf = self.atlas.keyframes
-            frame.R, frame.t = kf.R[k].copy(), kf.t[k].copy()
-            frame.point = kf.point[k, : len(frame.features)].copy()
-            self._since_keyframe = 0
-            self.graph_version += 1
-            new.append(NewKeyframe(int(kf.serial[k]), inverse(pose(frame.R, frame.t))))
-            graph = self._graph("local_ba" if self.graph_version > 1 else "keyframe")
+            new, graph = self._make_keyframe(frame)
         self._set_anchor(frame)
         self._last = frame
         self._log.stamp_ns.append(stamp_ns)
         self._log.keyframe.append(self._reference)
         self._log.T_keyframe_camera.append(self._anchor)
         return self._result(stamp_ns, "tracking", frame, new, graph)
+
+    def _make_keyframe(self, frame: Tracked) -> tuple[list[NewKeyframe], GraphUpdate]:
+        """Put the frame into the map as a keyframe; the frame takes over what mapping makes of it."""
+        k = self.mapping.insert(frame.features, frame.R, frame.t, frame.point)
+        reason: GraphReason = "local_ba" if self.graph_version else "keyframe"
+        correction = self.loops.consider(k) if self.config.loop_closing else None
+        if correction is not None:
+            reason = "loop"
+            if correction.jump_m > _JUMP_M or correction.jump_rad > _JUMP_RAD:
+                self._count_reset()
+        kf = self.atlas.keyframes
+        frame.R, frame.t = kf.R[k].copy(), kf.t[k].copy()
+        frame.point = kf.point[k, : len(frame.features)].copy()
+        self._since_keyframe = 0
+        self.graph_version += 1
+        return [NewKeyframe(int(kf.serial[k]), inverse(pose(frame.R, frame.t)))], self._graph(reason)
 
     def _set_anchor(self, frame: Tracked) -> None:
         kf = self.atlas.keyframes
@@ -170,6 +199,7 @@ class Slam:
         return self._graph("full_ba")
 
     def _lost(self, stamp_ns: int) -> TrackResult:
+        self._step = np.eye(4)
         return self._result(stamp_ns, "lost", None, [], None)
 
     def _graph(self, reason: GraphReason) -> GraphUpdate:

@@ -152,23 +152,29 @@ class Tracking:
         kept[queries[inliers[:, 0]]] = match[queries[inliers[:, 0]]]
         return self._locate(features, np.ascontiguousarray(R), np.ascontiguousarray(t[:, 0]), world, kept, known)
 
-    def join_map(self, frame: Tracked, window_px: float = _WINDOW_MAP_PX) -> tuple[Tracked, int] | None:
+    def join_map(self, frame: Tracked) -> tuple[Tracked, int] | None:
         """Match the frame with the local map and refine; returns it and its best keyframe slot, None when that fails."""
-        atlas, cam = self.atlas, self.camera
+        atlas = self.atlas
         counts = shared_counts(atlas.points, frame.point, len(atlas.keyframes.n))
         if not counts.any():
             return None
-        slots = self._local_keyframes(counts)
-        ids = points_of(atlas.points, atlas.keyframes, slots)
-        taken = np.zeros(len(atlas.points.n), np.bool_)
+        located = self.join_keyframes(frame, self._local_keyframes(counts), _WINDOW_MAP_PX, tally=True)
+        if located is None:
+            return None
+        counts = shared_counts(atlas.points, located.point, len(atlas.keyframes.n))
+        return located, int(np.lexsort((-atlas.keyframes.serial, -counts))[0])
+
+    def join_keyframes(self, frame: Tracked, slots: I32, window_px: float, *, tally: bool = False) -> Tracked | None:
+        """Match the frame with the points that keyframes ``slots`` see and refine; ``tally`` keeps the points' counters."""
+        f, cam, p = frame.features, self.camera, self.atlas.points
+        ids = points_of(p, self.atlas.keyframes, slots)
+        taken = np.zeros(len(p.n), np.bool_)
         taken[frame.point[frame.point >= 0]] = True
         ids = ids[~taken[ids]]
         m = len(ids)
         place, octave, cosine = np.empty((m, 3)), np.zeros(m, np.int32), np.empty(m)
-        p = atlas.points
         project(ids, p.pos, p.normal, p.near, p.far, frame.R, frame.t, cam.array, cam.width, cam.height,
                 self.config.scale, self.config.levels, place, octave, cosine)  # fmt: skip
-        f = frame.features
         match = match_windows(
             place, window_px * cam.scales[octave], octave - 1, octave + 1, p.desc[ids], f.uv, f.disparity, f.octave, f.desc,
             f.cell_start, f.cell_items, cam.cols, frame.point < 0, MATCH_LOOSE, 0.8,
@@ -179,16 +185,14 @@ class Tracking:
         index = np.flatnonzero(point >= 0)
         R, t = frame.R.copy(), frame.t.copy()
         count, use, H, chi2 = self.refine(f, R, t, p.pos[point[index]], index)
-        seen = np.concatenate([ids[~np.isnan(place[:, 0])], frame.point[frame.point >= 0]])
-        np.add.at(p.visible, seen, 1)
+        if tally:
+            p.visible[ids[~np.isnan(place[:, 0])]] += 1
+            p.visible[frame.point[frame.point >= 0]] += 1
+            p.found[point[index[use]]] += 1
         if count < 6:
             return None
-        np.add.at(p.found, point[index[use]], 1)
         point[index[~use]] = -1
-        located = Tracked(f, R, t, point, count, H, chi2)
-        counts = shared_counts(atlas.points, point, len(atlas.keyframes.n))
-        best = np.lexsort((-atlas.keyframes.serial, -counts))[0]
-        return located, int(best)
+        return Tracked(f, R, t, point, count, H, chi2)
 
     def _local_keyframes(self, counts: I32) -> I32:
         atlas = self.atlas

@@ -25,6 +25,17 @@ def warm() -> None:
     for index in range(4):
         shift = 4 * index
         slam.track(index, np.ascontiguousarray(np.roll(grey, shift, axis=1)), depth_m)
+    _warm_loop(slam)
     slam.polish()
     slam.final_trajectory()
     _done = True
+
+
+def _warm_loop(slam: Slam) -> None:
+    """Close a loop of the scene with itself, and relocate in it."""
+    slots = slam.atlas.slots
+    features = slam.atlas.features_of(int(slots[-1]))
+    slam.loops.relocate(features)
+    found = slam.loops.place(features, int(slots[0]))
+    if found is not None:
+        slam.loops.close(int(slots[-1]), int(slots[0]), found)
