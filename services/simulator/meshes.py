@@ -95,9 +95,9 @@ def _bumpy_radii(tree: SceneTree, heights: Floats) -> Floats:
 
 def _fork_stems(tree: SceneTree, fork_m: float) -> list[Mesh]:
     rng = np.random.default_rng([tree.seed, 2])
-    first, second = frame_across(tree.axis)
-    heading = rng.uniform(0.0, math.pi)
-    across = math.cos(heading) * first + math.sin(heading) * second
+    # within 50 degrees of broadside to the start, or nobody could tell from there that it forks
+    heading = math.atan2(tree.y_m, tree.x_m) + 0.5 * math.pi + rng.uniform(-0.87, 0.87)
+    across = np.array([math.cos(heading), math.sin(heading), 0.0])
     radius = float(tree.mean_radius(fork_m))
     lengths = np.linspace(-0.1, tree.height_m - fork_m, 20)
     stems = []
