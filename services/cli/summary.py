@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from schemas.simulation import SimTruth, TrueTree
@@ -61,11 +62,13 @@ def tree_table(trees: TreeList | None, truth: SimTruth | None) -> Table:
     found = trees.trees if trees else ()
     true = truth.trees if truth else ()
     pairs = pair(found, true)
-    table = Table(title=None if truth is None else f"scene {truth.scene}", header_style="bold")
+    table = Table(
+        title=None if truth is None else f"scene {truth.scene}", header_style="bold", box=SIMPLE_HEAD, pad_edge=False
+    )
     columns = ["tree", "x m", "y m", "radius cm", "confidence", "suitable"]
-    columns += ["true x", "true y", "true radius", "off by cm"] if truth is not None else []
+    columns += ["true x", "y", "radius", "off cm"] if truth is not None else []
     for column in columns:
-        table.add_column(column, justify="right")
+        table.add_column(column, justify="right", no_wrap=True)
     for i, tree in enumerate(found):
         cells = [
             str(tree.id), f"{tree.x_m:.2f}", f"{tree.y_m:.2f}", f"{100 * tree.radius_m:.1f}",
@@ -84,7 +87,7 @@ def _true_cells(tree: TrueTree) -> tuple[str, str, str]:
 
 def _beside(tree: Tree, true: TrueTree | None) -> tuple[str, ...]:
     if true is None:
-        return ("no such tree", "", "", "")
+        return ("none", "", "", "")
     return (*_true_cells(true), f"{100 * math.hypot(tree.x_m - true.x_m, tree.y_m - true.y_m):.1f}")
 
 

@@ -86,12 +86,13 @@ def _from_file(path: Path) -> list[_Setting]:
     return list(_flatten(body, TreedockConfig, "", str(path)))
 
 
-def _flatten(body: Mapping[str, object], model: type[BaseModel], prefix: str, origin: str) -> Iterable[_Setting]:
+def _flatten(body: Mapping[str, object], model: type[BaseModel] | None, prefix: str, origin: str) -> Iterable[_Setting]:
     """Yield the settings of a nested mapping, section by section as the tree knows them."""
     for name, value in body.items():
         key = f"{prefix}{name}"
-        section = _section(model, name)
-        if section is not None and isinstance(value, Mapping):
+        section = _section(model, name) if model else None
+        unknown = model is None or name not in model.model_fields
+        if (section is not None or unknown) and isinstance(value, Mapping) and value:
             yield from _flatten(value, section, f"{key}.", origin)
         else:
             yield _Setting(key, value, origin)

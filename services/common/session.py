@@ -20,6 +20,12 @@ LOG = logging.getLogger(__name__)
 
 _CLOSE_TIMEOUT_S = 0.5
 _RETRY_S = 0.1
+_PRIORITIES = (
+    "control", "real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background",
+)  # fmt: skip
+_QUEUE_BATCHES = 16
+"""Sent messages that may wait per priority, the most Zenoh allows. Of 420 small messages in bursts of seven, up to 6
+were lost per subscriber on a loaded two-core machine with the default of 2, none with 16."""
 _TELL_AFTER_S = 2.0
 _ENOUGH_LOCKED_BYTES = 64 * 1024 * 1024
 
@@ -47,6 +53,8 @@ def _config(values: dict[str, object]) -> zenoh.Config:
         "scouting/delay": 0,  # milliseconds; the default waits half a second at each open
         "timestamping/enabled": True,  # the advanced publisher's late joiners need it
     }
+    for priority in _PRIORITIES:
+        common[f"transport/link/tx/queue/size/{priority}"] = _QUEUE_BATCHES
     for key, value in {**common, **values}.items():
         config.insert_json5(key, json.dumps(value))
     return config

@@ -1,0 +1,125 @@
+"""The configuration: which source wins, and what a mistake is told."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from services.common.config import TreedockConfig
+from services.common.config_loader import known_keys, load, to_toml
+from services.common.errors import InputError
+
+
+def write(folder: Path, name: str, text: str) -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_defaults_alone(tmp_path: Path) -> None:
+    found = load(environ={}, system_directory=tmp_path)
+    assert found.config == TreedockConfig()
+    assert found.origins == {}
+
+
+def test_each_source_wins_over_the_one_before(tmp_path: Path) -> None:
+    system = tmp_path / "etc"
+    system.mkdir()
+    write(system, "10-a.toml", 'uav = "a"\n[router]\nport = 1001\n[slam]\nfeatures = 501\nlevels = 3\n')
+    write(system, "20-b.toml", "[router]\nport = 1002\n")
+    own = write(tmp_path, "own.toml", "[router]\nport = 1003\n[slam]\nfeatures = 503\n")
+
+    def port(**more: object) -> int:
+        return load(system_directory=system, **{"environ": {}, **more}).config.router.port  # type: ignore[arg-type]
+
+    assert port() == 1002
+    assert port(file=own) == 1003
+    assert port(file=own, environ={"TREEDOCK_ROUTER__PORT": "1004"}) == 1004
+    assert port(file=own, environ={"TREEDOCK_ROUTER__PORT": "1004"}, flags=["router.port=1005"]) == 1005
+    assert port(file=own, flags=["router.port=1005"], overrides={"router.port": 1006}) == 1006
+    found = load(own, environ={"TREEDOCK_CLOCK": "sim"}, system_directory=system)
+    assert (found.config.uav, found.config.slam.features, found.config.slam.levels) == ("a", 503, 3)
+    assert found.origins["slam.levels"] == str(system / "10-a.toml")
+    assert found.origins["slam.features"] == str(own)
+    assert found.origins["clock"] == "TREEDOCK_CLOCK"
+
+
+def test_a_file_can_be_named_by_a_variable(tmp_path: Path) -> None:
+    own = write(tmp_path, "own.json", '{"router": {"port": 1010}}')
+    assert load(environ={"TREEDOCK_CONFIG": str(own)}, system_directory=tmp_path / "no").config.router.port == 1010
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[slam]\nfeaturs = 5\n", ("slam.featurs", "slam.features")),
+        ("[slma]\nfeatures = 500\n", ("slma", "slam.features")),
+        ("[slam]\nfeatures = 'many'\n", ("slam.features", "'many'")),
+        ("[slam]\nfeatures = 1\n", ("slam.features = 1", "100")),
+        ("[slam\n", ("not valid TOML",)),
+        ("slam = 5\n", ("slam", "section")),
+        ('uav = "a/b"\n', ("uav = 'a/b'",)),
+        ("[camera]\nmin_range_m = 9.0\n", ("camera", "min_range_m 9.0")),
+    ],
+)
+def test_a_mistake_names_the_file_and_the_key(tmp_path: Path, text: str, words: tuple[str, ...]) -> None:
+    own = write(tmp_path, "own.toml", text)
+    with pytest.raises(InputError) as error:
+        load(own, environ={}, system_directory=tmp_path / "no")
+    said = str(error.value)
+    assert str(own) in said
+    for word in words:
+        assert word in said
+    assert "\n" not in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"file": Path("/nowhere/x.toml")}, "/nowhere/x.toml"),
+        ({"environ": {"TREEDOCK_ROUTER__PROT": "1"}}, "TREEDOCK_ROUTER__PROT: unknown key 'router.prot'"),
+        ({"environ": {"TREEDOCK_ROUTER__PORT": "http"}}, "TREEDOCK_ROUTER__PORT: router.port = 'http'"),
+        ({"flags": ["slam.features"]}, "expected section.key=value"),
+        ({"flags": ["slam.feature=700"]}, "the nearest is 'slam.features'"),
+    ],
+)
+def test_mistakes_outside_of_files(tmp_path: Path, arguments: dict[str, object], words: str) -> None:
+    with pytest.raises(InputError) as error:
+        load(**{"environ": {}, "system_directory": tmp_path, **arguments})  # type: ignore[arg-type]
+    assert words in str(error.value)
+
+
+def test_a_file_that_is_not_text_is_told(tmp_path: Path) -> None:
+    own = tmp_path / "own.toml"
+    own.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match=r"own\.toml"):
+        load(own, environ={}, system_directory=tmp_path / "no")
+
+
+@given(st.text(max_size=40))
+def test_any_value_gives_a_configuration_or_one_line(value: str) -> None:
+    said = ""
+    try:
+        load(environ={"TREEDOCK_UAV": value, "TREEDOCK_SLAM__LEVELS": value}, system_directory=Path("/no"))
+    except InputError as error:
+        said = str(error)
+    assert "\n" not in said
+
+
+def test_the_dump_reads_back_as_the_same_tree(tmp_path: Path) -> None:
+    found = load(environ={"TREEDOCK_SLAM__FEATURES": "800"}, system_directory=tmp_path)
+    text = to_toml(found.config.model_dump(mode="json"), found.origins)
+    assert "features = 800  # from TREEDOCK_SLAM__FEATURES" in text
+    again = load(write(tmp_path, "dump.toml", text), environ={}, system_directory=tmp_path / "no")
+    assert again.config == found.config
+    assert set(tomllib.loads(text)) >= {"slam", "router", "camera"}
+
+
+def test_every_setting_is_reachable_by_a_variable() -> None:
+    keys = known_keys()
+    assert {"uav", "router.port", "refiner.noise.disparity_px", "detector.slicing.voxel_m"} <= set(keys)
+    assert len({key.lower() for key in keys}) == len(keys)
