@@ -20,7 +20,9 @@ from services.detector.voxels import Voxels
 
 RIM = 0.92
 """Share of the radius beyond which the ray residual is continued linearly."""
-_COLUMNS = 11
+_COLUMNS = 10
+"""layer, x, y, z, radius, noise, points on, points inside, arc, range."""
+_PER_CLUSTER = 5
 _MOST = 240
 """Points of one circle that its fit uses at most; the joint fit of the trunk uses more."""
 BINS = 36
@@ -294,59 +296,75 @@ def _judge(
 
 
 @njit(cache=True, nogil=True)
+def _load(
+    xyz: Floats, ray: Floats, members: Ints, k_range: float, surface: float, spacing: float, P: Floats, U: Floats,
+    G: Floats, S: Floats,
+) -> None:  # fmt: skip
+    """Copy a cluster's points, unit rays in the plan, ranges, and how far a point may be from a seed circle."""
+    for q in range(members.shape[0]):
+        v = members[q]
+        flat = np.sqrt(ray[v, 0] ** 2 + ray[v, 1] ** 2)
+        G[q] = np.sqrt(flat * flat + ray[v, 2] ** 2)
+        for a in range(3):
+            P[q, a] = xyz[v, a]
+        for a in range(2):
+            U[q, a] = ray[v, a] / flat if flat > 1e-6 else 0.0
+        S[q] = 2.0 * np.sqrt((k_range * G[q] ** 2) ** 2 + surface * surface) + 0.25 * spacing
+
+
+@njit(cache=True, nogil=True)
+def _circles_of_cluster(
+    P: Floats, U: Floats, G: Floats, S: Floats, n: int, k_range: float, surface: float, r_min: float, r_max: float,
+    min_points: int, trials: int, state: Ints, out: Floats,
+) -> int:  # fmt: skip
+    """Take circle after circle out of a cluster; fill rows of ``out`` and return their number."""
+    left, taken, near = np.arange(n), np.empty(n, dtype=np.int64), np.empty(_MOST, dtype=np.int64)
+    circle = np.empty(3)
+    rows, first = 0, n
+    while rows < out.shape[0] and n >= max(min_points, 0.1 * first):
+        if _seed(P, U, S, left, n, state, trials, r_min, r_max, circle) < 0.5 * min_points:
+            break
+        m = _neighbourhood(P, S, left, n, circle, near)
+        scale = _refine(P, U, G, near, m, circle, k_range, surface, r_min, r_max)
+        if scale < 0.0:
+            break
+        on = _judge(P, U, G, left, n, circle, scale, k_range, surface, out[rows], taken)
+        out[rows, 9] = G[left[0]]
+        good = on >= min_points and r_min <= circle[2] <= r_max
+        rows += 1 if good else 0
+        kept = 0
+        for q in range(n):
+            if taken[q] == 0:
+                left[kept] = left[q]
+                kept += 1
+        if kept == n:
+            break
+        n = kept
+    return rows
+
+
+@njit(cache=True, nogil=True)
 def _all_slices(
     xyz: Floats, ray: Floats, order: Ints, begin: Ints, z_low: float, layer_m: float, k_range: float, surface: float,
     spacing: float, r_min: float, r_max: float, min_points: int, trials: int, seed: int, out: Floats,
 ) -> int:  # fmt: skip
-    rows = 0
-    largest = 0
+    rows, largest = 0, 0
     for c in range(begin.shape[0] - 1):
         largest = max(largest, begin[c + 1] - begin[c])
     P, U, G, S = np.empty((largest, 3)), np.empty((largest, 2)), np.empty(largest), np.empty(largest)
-    left, taken = np.empty(largest, dtype=np.int64), np.empty(largest, dtype=np.int64)
-    near = np.empty(_MOST, dtype=np.int64)
-    circle = np.empty(3)
     state = np.empty(1, dtype=np.int64)
     for c in range(begin.shape[0] - 1):
         n = begin[c + 1] - begin[c]
         if n < min_points:
             continue
         state[0] = seed + 7919 * c
-        for q in range(n):
-            v = order[begin[c] + q]
-            flat = np.sqrt(ray[v, 0] ** 2 + ray[v, 1] ** 2)
-            G[q] = np.sqrt(flat * flat + ray[v, 2] ** 2)
-            for a in range(3):
-                P[q, a] = xyz[v, a]
-            for a in range(2):
-                U[q, a] = ray[v, a] / flat if flat > 1e-6 else 0.0
-            S[q] = 2.0 * np.sqrt((k_range * G[q] ** 2) ** 2 + surface * surface) + 0.25 * spacing
-            left[q] = q
-        first = n
-        for turn in range(5):
-            if n < min_points or (turn > 0 and n < 0.1 * first) or rows >= out.shape[0]:
-                break
-            tries = trials if first < 400 else 2 * trials
-            if _seed(P, U, S, left, n, state, tries, r_min, r_max, circle) < 0.5 * min_points:
-                break
-            m = _neighbourhood(P, S, left, n, circle, near)
-            scale = _refine(P, U, G, near, m, circle, k_range, surface, r_min, r_max)
-            if scale < 0.0:
-                break
-            on = _judge(P, U, G, left, n, circle, scale, k_range, surface, out[rows], taken)
-            out[rows, 0] = np.floor((P[left[0], 2] - z_low) / layer_m)
-            out[rows, 9] = G[left[0]]
-            out[rows, 10] = c
-            if on >= min_points and r_min <= circle[2] <= r_max:
-                rows += 1
-            kept = 0
-            for q in range(n):
-                if taken[q] == 0:
-                    left[kept] = left[q]
-                    kept += 1
-            if kept == n:
-                break
-            n = kept
+        _load(xyz, ray, order[begin[c] : begin[c + 1]], k_range, surface, spacing, P, U, G, S)
+        tries = trials if n < 400 else 2 * trials
+        room = out[rows : min(rows + _PER_CLUSTER, out.shape[0])]
+        found = _circles_of_cluster(P, U, G, S, n, k_range, surface, r_min, r_max, min_points, tries, state, room)
+        for k in range(found):
+            room[k, 0] = np.floor((P[0, 2] - z_low) / layer_m)
+        rows += found
     return rows
 
 
@@ -370,7 +388,7 @@ def fit_slices(
 ) -> Circles:
     """Return the circles found in every cluster of every layer (several where a cluster holds several)."""
     clusters = int(np.count_nonzero(np.diff(begin) >= config.min_slice_points))
-    out = np.zeros((2 * clusters + 64, _COLUMNS))
+    out = np.zeros((_PER_CLUSTER * clusters + 8, _COLUMNS))
     rows = int(
         _all_slices(
             voxels.xyz_m, voxels.ray_m, order, begin, float(low[2]), layer_m, config.range_noise_per_m,

@@ -77,58 +77,87 @@ def _near(
 
 
 @njit(cache=True, nogil=True)
+def _residuals(
+    P: Floats, U: Floats, G: Floats, x: Floats, k_range: float, surface: float, e: Floats, sigma: Floats
+) -> None:
+    """Write each point's residual as a share of its expected noise, and that noise."""
+    J = np.empty(3)
+    for i in range(P.shape[0]):
+        z = P[i, 2]
+        cx, cy, r = x[0] + x[2] * z, x[1] + x[3] * z, max(x[4] + x[5] * z, 0.005)
+        s = ((cx - P[i, 0]) * U[i, 1] - (cy - P[i, 1]) * U[i, 0]) / r
+        sigma[i] = point_sigma(s, G[i], U[i, 0] != 0.0 or U[i, 1] != 0.0, k_range, surface)
+        e[i] = residual(P[i, 0], P[i, 1], U[i, 0], U[i, 1], cx, cy, r, J) / sigma[i]
+
+
+@njit(cache=True, nogil=True)
+def _robust_scale(e: Floats, scale: float) -> float:
+    """Return the spread of the residuals near zero (median absolute deviation), at least 1; -1 when too few are near."""
+    near = 0
+    size = np.empty(e.shape[0])
+    for i in range(e.shape[0]):
+        if abs(e[i]) < 4.5 * scale:
+            size[near] = abs(e[i])
+            near += 1
+    return max(1.0, 1.4826 * np.median(size[:near])) if near >= 10 else -1.0
+
+
+@njit(cache=True, nogil=True)
+def _normal_equations(
+    P: Floats, U: Floats, weight: float, x: Floats, e: Floats, sigma: Floats, scale: float, A: Floats, y: Floats
+) -> None:
+    """Sum the weighted normal matrix and its right side."""
+    J, K = np.empty(3), np.empty(6)
+    A[:] = 0.0
+    y[:] = 0.0
+    for i in range(P.shape[0]):
+        t = e[i] / (4.0 * scale)
+        if abs(t) >= 1.0:
+            continue
+        z = P[i, 2]
+        residual(
+            P[i, 0], P[i, 1], U[i, 0], U[i, 1], x[0] + x[2] * z, x[1] + x[3] * z, max(x[4] + x[5] * z, 0.005), J
+        )  # fmt: skip
+        K[0], K[1], K[2], K[3], K[4], K[5] = J[0], J[1], J[0] * z, J[1] * z, J[2], J[2] * z
+        w = weight * (1.0 - t * t) ** 2 / (scale * scale * sigma[i])
+        for a in range(6):
+            y[a] -= w * e[i] * K[a]
+            for b in range(a + 1):
+                A[a, b] += w * K[a] * K[b] / sigma[i]
+    for a in range(6):
+        for b in range(a):
+            A[b, a] = A[a, b]
+
+
+@njit(cache=True, nogil=True)
 def _fit(
-    P: Floats, U: Floats, G: Floats, W: Floats, x: Floats, k_range: float, surface: float, start: float, prior: Floats,
-    normal: Floats,
+    P: Floats, U: Floats, G: Floats, weight: float, x: Floats, k_range: float, surface: float, start: float,
+    prior: Floats, normal: Floats,
 ) -> float:  # fmt: skip
-    """Improve ``x`` = (cx, cy, slope x, slope y, radius, taper) in the axis frame; return the scale factor."""
-    n = P.shape[0]
-    J, K, A, y, step = np.empty(3), np.empty(6), np.empty((6, 6)), np.empty(6), np.empty(6)
-    e, sigma, size = np.empty(n), np.empty(n), np.empty(n)
+    """Improve ``x`` = (cx, cy, slope x, slope y, radius, taper) in the axis frame; return the scale factor.
+
+    ``prior`` (6, 2) holds mean and inverse variance of each parameter; ``normal`` receives the normal matrix.
+    """
+    A, y, step = np.empty((6, 6)), np.empty(6), np.empty(6)
+    e, sigma = np.empty(P.shape[0]), np.empty(P.shape[0])
     scale = start
     for _ in range(15):
-        near = 0
-        for i in range(n):
-            z = P[i, 2]
-            cx, cy, r = x[0] + x[2] * z, x[1] + x[3] * z, max(x[4] + x[5] * z, 0.005)
-            s = ((cx - P[i, 0]) * U[i, 1] - (cy - P[i, 1]) * U[i, 0]) / r
-            sigma[i] = point_sigma(s, G[i], U[i, 0] != 0.0 or U[i, 1] != 0.0, k_range, surface)
-            e[i] = residual(P[i, 0], P[i, 1], U[i, 0], U[i, 1], cx, cy, r, J) / sigma[i]
-            if abs(e[i]) < 4.5 * scale:
-                size[near] = abs(e[i])
-                near += 1
-        if near < 10:
+        _residuals(P, U, G, x, k_range, surface, e, sigma)
+        scale = _robust_scale(e, scale)
+        if scale < 0.0:
             return -1.0
-        scale = max(1.0, 1.4826 * np.median(size[:near]))
-        A[:] = 0.0
-        y[:] = 0.0
-        for i in range(n):
-            t = e[i] / (4.0 * scale)
-            if abs(t) >= 1.0:
-                continue
-            z = P[i, 2]
-            cx, cy, r = x[0] + x[2] * z, x[1] + x[3] * z, max(x[4] + x[5] * z, 0.005)
-            residual(P[i, 0], P[i, 1], U[i, 0], U[i, 1], cx, cy, r, J)
-            K[0], K[1], K[2], K[3], K[4], K[5] = J[0], J[1], J[0] * z, J[1] * z, J[2], J[2] * z
-            w = W[i] * (1.0 - t * t) ** 2 / (sigma[i] * scale)
-            for a in range(6):
-                y[a] -= w * e[i] * K[a] / scale
-                for b in range(a + 1):
-                    A[a, b] += w * K[a] * K[b] / (sigma[i] * scale)
-        for a in range(6):
-            for b in range(a):
-                A[b, a] = A[a, b]
+        _normal_equations(P, U, weight, x, e, sigma, scale, A, y)
         for a in range(6):
             A[a, a] += prior[a, 1]
             y[a] += prior[a, 1] * (prior[a, 0] - x[a])
         normal[:] = A
         solve(A, y, step)
-        size_step = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[4] ** 2)
-        limit = min(1.0, 0.3 * x[4] / max(size_step, 1e-12))
+        size = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[4] ** 2)
+        limit = min(1.0, 0.3 * x[4] / max(size, 1e-12))
         for a in range(6):
             x[a] += limit * step[a]
         x[4] = max(x[4], 0.008)
-        if size_step < 2e-5:
+        if size < 2e-5:
             break
     return scale
 
@@ -210,9 +239,8 @@ def fit_cylinder(voxels: Voxels, stack: Stack, config: DetectorConfig) -> Cylind
             [0.0, 1e-6], [0.0, 1e-6], [0.0, 1.0 / (4 * _PRIOR_SLOPE) ** 2], [0.0, 1.0 / (4 * _PRIOR_SLOPE) ** 2],
             [radius, 1e-6], [mean_taper, 1.0 / _PRIOR_TAPER**2],
         ])  # fmt: skip
-        W = np.full(len(P), every / _CORRELATED)
         scale = float(
-            _fit(P, U, G, W, x, config.range_noise_per_m, config.surface_noise_m, 3.0 if turn == 0 else scale, prior, normal)
+            _fit(P, U, G, every / _CORRELATED, x, config.range_noise_per_m, config.surface_noise_m, 3.0 if turn == 0 else scale, prior, normal)
         )  # fmt: skip
         if scale < 0.0:
             return None
@@ -221,11 +249,11 @@ def fit_cylinder(voxels: Voxels, stack: Stack, config: DetectorConfig) -> Cylind
         slope, radius = axis[:2] / axis[2], float(x[4])
         if not 0.01 <= radius <= 1.5 or np.hypot(*slope) > 1.5:
             return None
-    return _measured(P, U, G, x, scale, R, at, slope, normal, config)
+    return _measured(P, U, G, x, scale, at, slope, normal, config)
 
 
 def _measured(
-    P: Floats, U: Floats, G: Floats, x: Floats, scale: float, R: Floats, at: Floats, slope: Floats, normal: Floats,
+    P: Floats, U: Floats, G: Floats, x: Floats, scale: float, at: Floats, slope: Floats, normal: Floats,
     config: DetectorConfig,
 ) -> Cylinder | None:  # fmt: skip
     on, counts = np.zeros(len(P), dtype=np.int64), np.zeros(6)
@@ -237,7 +265,7 @@ def _measured(
         return None
     axis = np.array([slope[0], slope[1], 1.0]) / np.sqrt(1.0 + float(slope @ slope))
     low, high = z_low + 0.1 * held[0], min(z_low + 0.1 * (held[-1] + 1), float(P[:, 2].max()))
-    covariance = np.linalg.inv(normal)
+    covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     return Cylinder(
         at_m=at, axis=axis, radius_m=float(x[4]), taper=float(x[5]), noise_m=float(counts[4]), scale=scale,
         points=int(counts[0]), inside=int(counts[1]), around=int(counts[2]), arc_rad=min(float(counts[3]), 2.0 * np.pi),

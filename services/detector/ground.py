@@ -58,7 +58,7 @@ def _cell_lows(
 
 @njit(cache=True, nogil=True)
 def _choose(lows: Floats, counts: Floats, cell_points: Floats, valid: NDArray[np.bool_]) -> None:
-    """Take one low point per cell; drop pits that a slope cannot explain, then cells that hang above their neighbours."""
+    """Take one low point per cell that has any; many points give more strays to pass over."""
     nx, ny = counts.shape
     for a in range(nx):
         for b in range(ny):
@@ -69,22 +69,32 @@ def _choose(lows: Floats, counts: Floats, cell_points: Floats, valid: NDArray[np
             for c in range(3):
                 cell_points[a, b, c] = lows[a, b, k, c]
             valid[a, b] = True
+
+
+@njit(cache=True, nogil=True)
+def _is_pit(cell_points: Floats, valid: NDArray[np.bool_], a: int, b: int) -> bool:
+    """Tell whether most neighbours lie higher than any slope explains."""
+    nx, ny = valid.shape
+    around, above = 0, 0
+    for i in range(max(0, a - 2), min(nx, a + 3)):
+        for j in range(max(0, b - 2), min(ny, b + 3)):
+            if not valid[i, j] or (i == a and j == b):
+                continue
+            around += 1
+            dx = cell_points[i, j, 0] - cell_points[a, b, 0]
+            dy = cell_points[i, j, 1] - cell_points[a, b, 1]
+            if cell_points[i, j, 2] - cell_points[a, b, 2] > np.sqrt(dx * dx + dy * dy) + 0.3:
+                above += 1
+    return around >= 4 and above > 0.7 * around
+
+
+@njit(cache=True, nogil=True)
+def _drop_pits(cell_points: Floats, valid: NDArray[np.bool_]) -> None:
+    nx, ny = valid.shape
     pits = np.zeros((nx, ny), dtype=np.bool_)
     for a in range(nx):
         for b in range(ny):
-            if not valid[a, b]:
-                continue
-            around, above = 0, 0
-            for i in range(max(0, a - 2), min(nx, a + 3)):
-                for j in range(max(0, b - 2), min(ny, b + 3)):
-                    if (i == a and j == b) or not valid[i, j]:
-                        continue
-                    around += 1
-                    dx = cell_points[i, j, 0] - cell_points[a, b, 0]
-                    dy = cell_points[i, j, 1] - cell_points[a, b, 1]
-                    if cell_points[i, j, 2] - cell_points[a, b, 2] > np.sqrt(dx * dx + dy * dy) + 0.3:
-                        above += 1
-            pits[a, b] = around >= 4 and above > 0.7 * around
+            pits[a, b] = valid[a, b] and _is_pit(cell_points, valid, a, b)
     for a in range(nx):
         for b in range(ny):
             if pits[a, b]:
@@ -266,6 +276,7 @@ def find_ground(points_m: NDArray[np.floating], frame: Upright, cell_m: float) -
     _cell_lows(points_m, frame.R, frame.shift, x0, y0, cell, lows, counts)
     cell_points, valid = np.zeros((nx, ny, 3)), np.zeros((nx, ny), dtype=np.bool_)
     _choose(lows, counts, cell_points, valid)
+    _drop_pits(cell_points, valid)
     _drop_hanging(cell_points, valid, cell)
     _drop_above_wide_plane(cell_points, valid, x0, y0, cell)
     planes = np.zeros((nx, ny, 3))

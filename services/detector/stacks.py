@@ -21,7 +21,6 @@ class Stack:
     slope: Floats
     """(2,): dx/dz, dy/dz."""
     radius_m: float
-    tolerance_m: float
     z_low_m: float
     z_high_m: float
     layers: int
@@ -29,15 +28,33 @@ class Stack:
     """Share of the layers between lowest and highest that show the circle."""
 
 
-@njit(cache=True, nogil=True)
-def _tolerance(noise: float, on: int, radius: float) -> float:
-    """Return how far a slice's centre may be off: a floor, and its noise, which few points average badly."""
-    return 0.015 + 0.10 * radius + 1.5 * noise / np.sqrt(max(1.0, on / 6.0))
+def _tolerance(noise_m: Floats, on: Ints, radius_m: Floats) -> Floats:
+    """Return how far each slice's centre may be off: a floor, and its noise, which few points average badly."""
+    return np.asarray(0.015 + 0.10 * radius_m + 1.5 * noise_m / np.sqrt(np.maximum(1.0, on / 6.0)))
 
 
 @njit(cache=True, nogil=True)
-def _link(layer: Ints, xyz: Floats, radius: Floats, noise: Floats, on: Ints, max_slope: float, group: Ints) -> int:
-    """Group circles that could follow each other within three layers; return the number of groups."""
+def _root(parent: Ints, a: int) -> int:
+    while parent[a] != a:
+        parent[a] = parent[parent[a]]
+        a = parent[a]
+    return a
+
+
+@njit(cache=True, nogil=True)
+def _may_follow(xyz: Floats, radius: Floats, tol: Floats, i: int, j: int, max_slope: float) -> bool:
+    """Tell whether circle ``j``, some layers above ``i``, could belong to the same trunk."""
+    both = tol[i] + tol[j]
+    reach = both + max_slope * (xyz[j, 2] - xyz[i, 2])
+    dx, dy = xyz[j, 0] - xyz[i, 0], xyz[j, 1] - xyz[i, 1]
+    if abs(dx) > reach or dx * dx + dy * dy > reach * reach:
+        return False
+    return abs(radius[i] - radius[j]) <= both + 0.2 * min(radius[i], radius[j])
+
+
+@njit(cache=True, nogil=True)
+def _link(layer: Ints, xyz: Floats, radius: Floats, tol: Floats, max_slope: float, group: Ints) -> None:
+    """Group circles that could follow each other within three layers: ``group`` gets one of the group's members."""
     n = layer.shape[0]
     order = np.argsort(layer, kind="mergesort")
     parent = np.arange(n)
@@ -48,37 +65,11 @@ def _link(layer: Ints, xyz: Floats, radius: Floats, noise: Floats, on: Ints, max
             gap = layer[j] - layer[i]
             if gap > 3:
                 break
-            if gap == 0:
-                continue
-            tol = _tolerance(noise[i], on[i], radius[i]) + _tolerance(noise[j], on[j], radius[j])
-            reach = tol + max_slope * (xyz[j, 2] - xyz[i, 2])
-            dx, dy = xyz[j, 0] - xyz[i, 0], xyz[j, 1] - xyz[i, 1]
-            if abs(dx) > reach or abs(dy) > reach or dx * dx + dy * dy > reach * reach:
-                continue
-            if abs(radius[i] - radius[j]) > tol + 0.2 * min(radius[i], radius[j]):
-                continue
-            a, b = i, j
-            while parent[a] != a:
-                parent[a] = parent[parent[a]]
-                a = parent[a]
-            while parent[b] != b:
-                parent[b] = parent[parent[b]]
-                b = parent[b]
-            if a < b:
-                parent[b] = a
-            else:
-                parent[a] = b
-    names = np.full(n, -1, dtype=np.int64)
-    groups = 0
+            if gap > 0 and _may_follow(xyz, radius, tol, i, j, max_slope):
+                a, b = _root(parent, i), _root(parent, j)
+                parent[max(a, b)] = min(a, b)
     for i in range(n):
-        a = i
-        while parent[a] != a:
-            a = parent[a]
-        if names[a] < 0:
-            names[a] = groups
-            groups += 1
-        group[i] = names[a]
-    return groups
+        group[i] = _root(parent, i)
 
 
 @njit(cache=True, nogil=True)
@@ -140,15 +131,18 @@ def _best_line(
 
 @njit(cache=True, nogil=True)
 def _all_lines(
-    layer: Ints, xyz: Floats, radius: Floats, noise: Floats, on: Ints, group: Ints, groups: int, max_slope: float,
-    min_support: float, line_of: Ints,
-) -> int:  # fmt: skip
+    layer: Ints,
+    xyz: Floats,
+    radius: Floats,
+    tol: Floats,
+    group: Ints,
+    max_slope: float,
+    min_support: float,
+    line_of: Ints,
+) -> int:
     """Give each circle the number of its line, or -1; return the number of lines."""
     n = layer.shape[0]
-    tol = np.empty(n)
-    for i in range(n):
-        tol[i] = _tolerance(noise[i], on[i], radius[i])
-        line_of[i] = -1
+    line_of[:] = -1
     order = np.argsort(group * np.int64(100000) + layer, kind="mergesort")
     lines, q = 0, 0
     while q < n:
@@ -177,11 +171,9 @@ def _all_lines(
     return lines
 
 
-def _as_stack(circles: Circles, members: Ints) -> Stack:
-    xyz, radius = circles.xyz_m[members], circles.radius_m[members]
-    tol = np.array(
-        [_tolerance(circles.noise_m[m], circles.on[m], circles.radius_m[m]) for m in members]
-    )  # fmt: skip
+def _as_stack(circles: Circles, tol_all: Floats, members: Ints) -> Stack:
+    """Return the weighted least-squares line through the circles of one candidate."""
+    xyz, radius, tol = circles.xyz_m[members], circles.radius_m[members], tol_all[members]
     weight = 1.0 / tol**2
     at = (weight[:, None] * xyz).sum(axis=0) / weight.sum()
     d = xyz - at
@@ -190,8 +182,8 @@ def _as_stack(circles: Circles, members: Ints) -> Stack:
     layers = circles.layer[members]
     extent = int(layers.max() - layers.min()) + 1
     return Stack(
-        at, slope, float(np.median(radius)), float(np.median(tol)), float(xyz[:, 2].min()), float(xyz[:, 2].max()),
-        len(members), len(members) / extent,
+        at, slope, float(np.median(radius)), float(xyz[:, 2].min()), float(xyz[:, 2].max()), len(members),
+        len(members) / extent,
     )  # fmt: skip
 
 
@@ -200,12 +192,11 @@ def stack_circles(circles: Circles, min_support: float, config: DetectorConfig) 
     n = len(circles.layer)
     if n == 0:
         return []
+    c = circles
+    tol = _tolerance(c.noise_m, c.on, c.radius_m)
     group, line_of = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
     max_slope = float(np.tan(config.max_lean_rad))
-    c = circles
-    groups = int(_link(c.layer, c.xyz_m, c.radius_m, c.noise_m, c.on, max_slope, group))
-    lines = int(
-        _all_lines(c.layer, c.xyz_m, c.radius_m, c.noise_m, c.on, group, groups, max_slope, min_support, line_of)
-    )
-    stacks = [_as_stack(circles, np.flatnonzero(line_of == k)) for k in range(lines)]
+    _link(c.layer, c.xyz_m, c.radius_m, tol, max_slope, group)
+    lines = int(_all_lines(c.layer, c.xyz_m, c.radius_m, tol, group, max_slope, min_support, line_of))
+    stacks = [_as_stack(circles, tol, np.flatnonzero(line_of == k)) for k in range(lines)]
     return sorted(stacks, key=lambda s: (-s.layers, s.at_m[0], s.at_m[1]))

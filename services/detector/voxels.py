@@ -27,9 +27,9 @@ class Voxels:
 
 
 @njit(cache=True, nogil=True)
-def _slot(table: Ints, keys: Ints, key: int) -> int:
+def _slot(table: Ints, keys: Ints, key: np.int64) -> np.int64:
     """Return the slot of ``key`` in an open-addressing table, or of the free place where it belongs."""
-    mask = table.shape[0] - 1
+    mask = np.int64(table.shape[0] - 1)
     at = (key * np.int64(-7046029254386353131) >> 20) & mask
     while table[at] >= 0 and keys[table[at]] != key:
         at = (at + 1) & mask
