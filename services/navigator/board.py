@@ -18,13 +18,14 @@ from services.navigator.docking import DockMonitor, DockSample
 from services.navigator.path import Disc
 from services.navigator.selection import axis_at
 from services.navigator.track import Correction, PoseTrack, Sample, Step, TrackLimits
-from services.navigator.trajectory import Aim, Trajectory
+from services.navigator.trajectory import Aim, Fence, Trajectory
 
 T = TypeVar("T")
 
 _AXIS_TIME_CONSTANT_S = 0.4
 _AXIS_GATE_M = 0.6
 _SCAN_BINS = 36
+_LEAST_FENCE_M = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +114,9 @@ class Board:
     """Of the pose taken at this step."""
     correction: Correction | None = None
     home_m: Matrix | None = None
-    home_yaw_rad: float = 0.0
+    home_known: bool = True
+    map_changed: bool = False
+    """The map was changed in flight: what was scanned is gone."""
     target_id: int | None = None
     axis_m: Matrix | None = None
     """Filtered trunk axis x, y (2,) of the target."""
@@ -223,15 +226,15 @@ class Board:
         if self.inputs.now_ns:
             self.dt_s = min(max((inputs.now_ns - self.inputs.now_ns) / 1e9, 0.0), 0.2)
         self.inputs, self.correction, self.step_kind = inputs, None, Step.STALE
-        before = None if self.track.latest is None else self.track.latest.map_id
+        before = self.track.latest
         if inputs.pose is not None:
             self.step_kind = self.track.add(inputs.pose.message, inputs.pose.received_ns)
             self.correction = self.track.correction
         if self.correction is not None:
             self._correct(self.correction)
-        after = None if self.track.latest is None else self.track.latest.map_id
-        if before is not None and after != before:
-            self._drop_map()
+        after = self.track.latest
+        if before is not None and after is not None and after.map_id != before.map_id:
+            self._drop_map(before, after)
         if self.here is not None and self.step_kind not in (Step.STALE, Step.LOST):
             self._count_scan(self.here)
         self._follow_target()
@@ -276,16 +279,31 @@ class Board:
         self.corners, self.planned_ns = [], -1
         self.dock.clear()
 
-    def _drop_map(self) -> None:
-        """Another map: nothing known by coordinates or id is valid in it."""
+    def _drop_map(self, before: Sample, after: Sample) -> None:
+        """Go over to another map: nothing known by id is valid in it, and coordinates only where a correction is known.
+
+        Without one the start's height is carried over by the height flown, and the fence shrinks by the distance
+        flown, so that no chain of new maps walks the aircraft away.
+        """
         self.drop_target()
         self.visited_ids, self.given_up_ids = [], []
         self.wanted_id = None
         self.scan_seen.clear()
-        if self.correction is None:
-            self.done_xy_m = []
-            if self.home_m is not None and self.track.latest is not None:
-                self.home_m = self.track.latest.position_m.copy()
+        self.scan_turned_rad = 0.0
+        self.map_changed = True
+        if self.correction is not None:
+            return
+        self.done_xy_m = []
+        self.home_known = False
+        moved = after.position_m - before.position_m
+        if self.home_m is not None:
+            self.home_m = self.home_m + moved
+        fence = self.trajectory.fence
+        if fence is not None:
+            flown = float(np.linalg.norm(before.position_m[:2] - fence.centre_m[:2]))
+            radius = max(fence.radius_m - flown, _LEAST_FENCE_M)
+            floor_z_m = fence.floor_z_m + float(moved[2])
+            self.trajectory.fence = Fence(after.position_m.copy(), floor_z_m, radius, fence.height_m)
 
     def _count_scan(self, here: Sample) -> None:
         self.scan_seen.add(int((here.yaw_rad + np.pi) / (2.0 * np.pi) * _SCAN_BINS) % _SCAN_BINS)

@@ -188,7 +188,7 @@ def _services(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
 
 def _target(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
     del w
-    if doing not in _VISUAL or not b.target_lost:
+    if doing not in _VISUAL or b.axis_m is None or not b.target_lost:
         return None
     seen = b.to_axis()
     if doing == "approach" and seen is not None and seen[0] > b.config.visual_range_m:

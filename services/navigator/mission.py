@@ -224,6 +224,10 @@ class Mission:
         target = _RESUME.get(self._resume, self._resume)
         if target in ("face", "approach", "docked", "undock") and self.board.axis_m is None:
             target = "select"
+        if self.board.map_changed and target != "take_off":
+            self.board.map_changed = False
+            done = self.board.docked_count >= self.board.trees_wanted
+            target, reason = ("landing" if done else "scan"), f"{reason}; in a new map"
         if self.board.trajectory.fence is None:
             self._prepare_flight()
         self._go(Next(target, reason), now_ns)
@@ -264,7 +268,7 @@ class Mission:
         here, m = self.board.here, self.config.motion
         if here is None:
             return
-        self.board.home_m, self.board.home_yaw_rad = here.position_m.copy(), here.yaw_rad
+        self.board.home_m = here.position_m.copy()
         if self._hold_cause == "restart":  # adopted in flight: the map's origin is the start
             self.board.home_m = np.zeros(3)
         home = self.board.home_m

@@ -198,7 +198,7 @@ def return_home(b: Board, since_s: float) -> Result:
     here = b.here
     if here is None:
         return Intent("stop", "freeze")
-    if b.home_m is None or b.config.handheld:
+    if b.home_m is None or not b.home_known:
         return Next("landing", "the start is not known in this map")
     left = float(np.linalg.norm(here.position_m[:2] - b.home_m[:2]))
     if left < 0.2:

@@ -84,6 +84,9 @@ class Trajectory:
         self.velocity_m_s = correction.vector(self.velocity_m_s)
         self.accel_m_s2 = correction.vector(self.accel_m_s2)
         self.yaw_rad += correction.yaw_rad
+        if self.fence is not None:
+            floor_z_m = self.fence.floor_z_m + float(correction.shift_m[2])
+            self.fence = replace(self.fence, centre_m=correction.point(self.fence.centre_m), floor_z_m=floor_z_m)
 
     def unwrapped(self, yaw_rad: float) -> float:
         """Return the yaw equal to ``yaw_rad`` that is nearest to the setpoint's: the smaller turn."""

@@ -1,0 +1,182 @@
+"""Whatever happens, in whatever order: the limits hold, nothing moves while slam is lost, nobody arms without a
+command, and in the end the aircraft is on the ground or in the pilot's hands."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from services.navigator.config import NavigatorConfig
+from services.navigator.mission import Mission
+from tests.unit.navigator_world import STEP_S, World, tree
+
+_SHORT = NavigatorConfig()
+_FAST = _SHORT.model_copy(
+    update={
+        "scan_rate_rad_s": float(np.radians(30.0)),
+        "trees_wanted": 2,
+        "motion": _SHORT.motion.model_copy(update={"fence_radius_m": 6.0}),
+    }
+)
+_EPS = 1e-6
+
+
+class Flights(RuleBasedStateMachine):
+    """Random events between stretches of flight, the checks at every single step."""
+
+    @initialize(layout=st.integers(0, 3))
+    def begin(self, layout: int) -> None:
+        forests = [
+            [tree(1, 4.0, 1.0), tree(2, -3.0, 2.0)],
+            [tree(1, 2.5, 0.0), tree(2, 2.6, 0.55), tree(3, 0.0, -3.0)],
+            [tree(1, 5.0, 3.0, 0.3, suitable=False)],
+            [],
+        ]
+        self.world = World(_FAST, forests[layout])
+        self.orders = 0
+        self.seen_order = 0
+
+    def _step(self, seconds: float) -> None:
+        for _ in range(round(seconds / STEP_S)):
+            self.world.step()
+            self._check()
+
+    def _check(self) -> None:
+        world, limits = self.world, _FAST.motion
+        assert world.outputs is not None
+        g = world.outputs.guidance
+        s = g.setpoint
+        assert world.armings <= self.orders, "armed without a command"
+        if s is None:
+            return
+        velocity = np.array(s.velocity_m_s)
+        assert np.linalg.norm(velocity) <= limits.max_speed_m_s + _EPS
+        assert abs(s.yaw_rate_rad_s) <= limits.max_yaw_rate_rad_s + _EPS
+        if not g.engage:
+            return
+        assert world.state not in ("idle", "preflight", "released", "landed", "failed")
+        fence = world.mission.board.trajectory.fence
+        if fence is not None and not g.land and world.state != "hold":
+            # the fence is where the map had it: a correction moves setpoint and home alike
+            home = world.mission.board.home_m
+            assert home is not None
+            away = np.array(s.position_m) - home
+            assert np.hypot(away[0], away[1]) <= limits.fence_radius_m + 0.05
+            assert -0.5 <= away[2] <= limits.fence_height_m + 0.05
+        lost = world.slam == "lost"
+        if lost:
+            assert not velocity.any(), "moving while slam is lost"
+            assert s.yaw_rate_rad_s == 0.0, "turning while slam is lost"
+            assert world.state in ("hold", "landing", "take_off")
+
+    @rule()
+    def start(self) -> None:
+        self._step(0.1)
+        if self.world.mission.order("start", None, self.world.now_ns).accepted:
+            self.orders += 1
+            self.world.override = False
+            self._step(0.1)
+
+    @rule(seconds=st.sampled_from([0.05, 0.5, 3.0, 12.0]))
+    def fly(self, seconds: float) -> None:
+        self._step(seconds)
+
+    @rule(order=st.sampled_from(["hold", "resume", "abort", "land", "next"]))
+    def order(self, order: str) -> None:
+        self.world.mission.order(order, None, self.world.now_ns)  # type: ignore[arg-type]
+        self._step(0.1)
+
+    @rule(tree_id=st.integers(0, 3))
+    def choose(self, tree_id: int) -> None:
+        self.world.mission.order("choose", tree_id, self.world.now_ns)
+        self._step(0.1)
+
+    @rule(status=st.sampled_from(["tracking", "lost", None]))
+    def slam(self, status: str | None) -> None:
+        self.world.slam = status  # type: ignore[assignment]
+        self._step(0.2)
+
+    @rule(x=st.floats(-2.0, 2.0), yaw=st.floats(-0.5, 0.5), told=st.booleans())
+    def correct(self, x: float, yaw: float, told: bool) -> None:
+        self.world.correct(np.array([x, -0.3 * x, 0.0]), yaw, told=told)
+        self._step(0.2)
+
+    @rule(name=st.sampled_from(["m1", "m2"]))
+    def new_map(self, name: str) -> None:
+        self.world.map_id = name
+        self._step(0.2)
+
+    @rule(visible=st.booleans(), alive=st.booleans())
+    def target(self, visible: bool, alive: bool) -> None:
+        self.world.target_visible, self.world.refiner_alive = visible, alive
+        self._step(0.2)
+
+    @rule(service=st.sampled_from(["camera", "slam", "mapper", "detector", "refiner"]), dead=st.booleans())
+    def service(self, service: str, dead: bool) -> None:
+        (self.world.dead.add if dead else self.world.dead.discard)(service)
+        self._step(0.2)
+
+    @rule(silent=st.booleans())
+    def link(self, silent: bool) -> None:
+        self.world.vehicle_silent = silent
+        self._step(0.2)
+
+    @rule(share=st.sampled_from([0.9, 0.3, 0.1, None]))
+    def battery(self, share: float | None) -> None:
+        self.world.battery = share
+        self._step(0.1)
+
+    @rule(dx=st.floats(-8.0, 8.0))
+    def gust(self, dx: float) -> None:
+        if self.world.armed:
+            self.world.position_m = self.world.position_m + np.array([dx, 0.0, 0.0])
+        self._step(0.1)
+
+    @precondition(lambda self: self.world.armed)
+    @rule(mode=st.sampled_from(["position", "manual", "hold"]))
+    def pilot(self, mode: str) -> None:
+        self.world.override, self.world.mode = True, mode
+        self._step(0.2)
+        assert self.world.outputs is not None
+        if not self.world.vehicle_silent:
+            assert not self.world.outputs.guidance.engage, "fighting the pilot"
+
+    @precondition(lambda self: self.world.override)
+    @rule()
+    def pilot_lands(self) -> None:
+        self.world.armed = False
+        self.world.position_m[2] = 0.0
+        self._step(0.1)
+
+    @rule()
+    def navigator_restarts(self) -> None:
+        self.world.mission = Mission(_FAST)
+        self._step(0.2)
+
+    @invariant()
+    def reason_is_always_told(self) -> None:
+        if hasattr(self, "world"):
+            assert self.world.mission.reason
+
+    def teardown(self) -> None:
+        if not hasattr(self, "world"):
+            return
+        world = self.world
+        world.vehicle_silent = False
+        world.battery = 0.1  # the battery ends every flight
+        for _ in range(round(60.0 / STEP_S)):
+            world.step()
+            self._check()
+            if not world.armed or world.override:
+                break
+        assert not world.armed or world.override, f"still flying: {world.state}, {world.mission.reason}"
+        world.run(seconds=0.2)
+        assert world.state in ("landed", "released", "failed", "idle", "preflight"), world.state
+
+
+TestFlights = Flights.TestCase
+TestFlights.settings = settings(
+    max_examples=25, stateful_step_count=14, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True
+)
