@@ -118,9 +118,10 @@ def echo(
     """Print each sample of a topic as a line of JSON; big byte strings are summarised."""
     from services.cli.readable import text
 
+    topic = _topic(name)
     with _joined(_tree(config, settings, port)) as (bus, stop):
         shown = 0
-        for sample in _samples(bus, _topic(name), name, stop):
+        for sample in _samples(bus, topic, name, stop):
             if sample is None:
                 continue
             key = str(sample.key_expr)
@@ -140,10 +141,11 @@ def hz(
     port: Port = None,
 ) -> None:
     """Measure a topic: rate, spread of the intervals, bytes per second, once a second."""
+    topic = _topic(name)
     with _joined(_tree(config, settings, port)) as (bus, stop):
         begin_s = window_s = time.monotonic()
         arrivals: list[tuple[float, int]] = []
-        for sample in _samples(bus, _topic(name), name, stop):
+        for sample in _samples(bus, topic, name, stop):
             now_s = time.monotonic()
             if sample is not None:
                 arrivals.append((now_s, len(sample.payload)))

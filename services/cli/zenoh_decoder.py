@@ -7,8 +7,11 @@ zenoh-cli must be told to be a client of our router: ``zenoh --mode client --con
 from __future__ import annotations
 
 
-def decode(key: str, value: bytes) -> str:
-    """Return the sample as one line of JSON; never raises for bytes that are not ours, but says so."""
+def decode(key: object, value: bytes) -> str:
+    """Return the sample as one line of JSON; never raises for bytes that are not ours, but says so.
+
+    zenoh-cli's own decoders are annotated for a key of type str; what 0.7 passes is Zenoh's KeyExpr.
+    """
     from services.cli.readable import text
 
-    return text(key, value)
+    return text(str(key), value)
