@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import math
+import socket
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from services.common.errors import InputError
 from services.common.geometry import Matrix
+from services.simulator.px4.config import LinkConfig
 from services.simulator.px4.control import AttitudeSetpoint, PositionController, Setpoint, attitude_rates
 from services.simulator.px4.frames import wxyz_from_yaw
 from services.simulator.px4.kernels import quaternion_times_exp, rotate
+from services.simulator.px4.links import UdpLink
 from services.simulator.px4.modes import BY_MODE, NavState, SetpointStream
 from services.simulator.px4.params import Parameters
 from services.simulator.px4.runner import RealTimeRunner
@@ -100,6 +104,28 @@ def test_timesync_learns_offset_and_skew_and_starts_anew_after_a_jump() -> None:
 
 def test_timesync_passes_arrival_time_until_it_has_converged() -> None:
     assert Timesync().to_autopilot_s(123.0, 7.0) == 7.0
+
+
+def test_udp_link_carries_datagrams_and_names_a_taken_port() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        peer.bind(("127.0.0.1", 0))
+        peer.settimeout(5.0)
+        link = UdpLink(LinkConfig(local_port=0, remote_port=peer.getsockname()[1]))
+        link.send(b"there")
+        data, sender = peer.recvfrom(100)
+        assert (data, sender) == (b"there", link.address)
+        assert link.receive() is None
+        with pytest.raises(InputError, match=f"{link.address[1]}"):
+            UdpLink(LinkConfig(local_port=link.address[1]))
+        link.close()
+
+
+def test_sending_to_nobody_is_no_error() -> None:
+    link = UdpLink(LinkConfig(local_port=0, remote_port=9))
+    for _ in range(3):
+        link.send(b"x")
+        assert link.receive() is None
+    link.close()
 
 
 def test_runner_hands_on_the_error_of_its_step() -> None:

@@ -90,5 +90,10 @@ class Px4Config(BaseModel):
     """What the autopilot's own clock shows when the simulation starts: never the companion's clock."""
     remote_control: bool = False
     """A radio control transmitter is connected from the start."""
+    links: tuple[LinkConfig, ...] = (
+        LinkConfig(),
+        LinkConfig(local_port=18570, remote_port=14550, ground_station=True),
+    )
+    """Opened by ``SimulatedPx4.open_links``; the ports are PX4 SITL's."""
     parameters: dict[str, float] = {}
     """Parameters that differ from PX4's defaults with the vision set of params.py applied."""

@@ -31,6 +31,8 @@ class Port:
     def __init__(self, link: Link, system_id: int, now_s: float, *, ground_station: bool) -> None:
         self.link = link
         self.ground_station = ground_station
+        self.heard = not ground_station
+        """A ground station's link carries only the heartbeat until somebody answers."""
         self.mav = m.MAVLink(None, srcSystem=system_id, srcComponent=_AUTOPILOT)
         self.mav.robust_parsing = True
         self.intervals_s = {ident: 1.0 / rate for ident, rate in RATES_HZ.items()}
@@ -108,6 +110,7 @@ class MavlinkServer:
         """Handle everything that has arrived."""
         for port in self.ports:
             while (data := port.link.receive()) is not None:
+                port.heard = True
                 for message in self._parse(port, data):
                     self._dispatch(port, message)
 
@@ -138,7 +141,7 @@ class MavlinkServer:
         now_s = self.vehicle.now_s
         for port in self.ports:
             for ident, interval_s in list(port.intervals_s.items()):
-                if now_s + 1e-9 >= port.due_s[ident]:
+                if now_s + 1e-9 >= port.due_s[ident] and (port.heard or ident == m.MAVLINK_MSG_ID_HEARTBEAT):
                     port.due_s[ident] = max(port.due_s[ident] + interval_s, now_s)
                     self._tell(port, ident)
             for parameter in port.parameters[:_PARAM_BURST]:

@@ -49,6 +49,7 @@ BY_MODE: dict[tuple[int, int], NavState] = {
 
 _NEEDS_POSITION = {NavState.POSITION, NavState.TAKEOFF, NavState.HOLD, NavState.RETURN, NavState.LAND}
 _NEEDS_GLOBAL = {NavState.HOLD, NavState.RETURN}
+_MANUAL = {NavState.ALTITUDE, NavState.MANUAL, NavState.STABILIZED, NavState.POSITION}
 _BY_LOSS_ACTION = {0: NavState.POSITION, 1: NavState.ALTITUDE, 2: NavState.MANUAL, 3: NavState.RETURN,
                    4: NavState.LAND, 5: NavState.HOLD}  # fmt: skip
 _ENDS_IN_HOLD = {NavState.LAND, NavState.TAKEOFF, NavState.RETURN}
@@ -177,8 +178,9 @@ class Commander:
             return False
         if state in _NEEDS_GLOBAL and not s.global_valid:
             return False
-        if state in (NavState.ALTITUDE, NavState.MANUAL, NavState.STABILIZED, NavState.POSITION):
-            return self.remote_control
+        if state in _MANUAL:
+            # COM_RC_IN_MODE 4 asks for no sticks: a ground station may take the craft into these modes
+            return self.remote_control or self._params.integer("COM_RC_IN_MODE") == 4
         return True
 
     # -- the cycle -----------------------------------------------------------------------------------------------
@@ -249,7 +251,8 @@ class Commander:
                 self._say(5, "Failsafe cleared")
             self.state, self.failsafe = self.intention, ""
             return
-        chosen = wanted if self.can_run(wanted) else next(f for f in _FALLBACKS if self.can_run(f))
+        manned = wanted not in _MANUAL or self.remote_control
+        chosen = wanted if manned and self.can_run(wanted) else next(f for f in _FALLBACKS if self.can_run(f))
         if cause != self.failsafe:
             self._say(2, f"Failsafe activated: {cause}, switching to {chosen.name.lower()}")
         self.state, self.failsafe = chosen, cause
@@ -264,7 +267,7 @@ class Commander:
             action = _BY_LOSS_ACTION.get(p.integer("COM_OBL_RC_ACT"), NavState.LAND)
             return action, "offboard signal lost"
         if not self.can_run(self.intention):
-            if self.intention is NavState.POSITION and self.can_run(NavState.ALTITUDE):
+            if self.intention is NavState.POSITION:
                 return NavState.ALTITUDE, "no position"
             return NavState.LAND, "no position" if not s.position_valid else "mode unavailable"
         return None, ""

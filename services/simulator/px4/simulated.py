@@ -37,6 +37,14 @@ class SimulatedPx4:
         self._links.append(link)
         return self._server.attach(link, ground_station=ground_station)
 
+    def open_links(self) -> list[tuple[str, int]]:
+        """Open the configured UDP links and return where they are bound.
+
+        Raises:
+            InputError: a port is taken.
+        """
+        return [self.listen(link) for link in self.config.links]
+
     def listen(self, config: LinkConfig) -> tuple[str, int]:
         """Open a UDP link and return the host and port it is bound to."""
         link = UdpLink(config)
