@@ -28,6 +28,7 @@ def bench(
     out: ResumeFolder = Path("bench"),
     data: DataFolder = None,
     scenes: Annotated[str, typer.Option("--scenes", help="Only these scenes, names separated by commas")] = "",
+    count: Annotated[int | None, typer.Option("--count", min=1, help="How many runs (missions)")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Less data: a look, not a measurement")] = False,
     doc: Annotated[Path | None, typer.Option("--doc", help="Put the result into this Markdown file")] = None,
     as_json: AsJson = False,
@@ -38,7 +39,7 @@ def bench(
 
     run = load_bench(name)
     options = BenchOptions(
-        seed=seed, out=out, scenes=tuple(part.strip() for part in scenes.split(",") if part.strip()), quick=quick,
+        seed=seed, out=out, scenes=tuple(part.strip() for part in scenes.split(",") if part.strip()), quick=quick, count=count,
         tell=lambda line: typer.echo(line, err=True), **({"data": data} if data is not None else {}),
     )  # fmt: skip
     report = run(options)

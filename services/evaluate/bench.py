@@ -39,6 +39,8 @@ class BenchOptions:
     """Folder of the real recordings."""
     scenes: tuple[str, ...] = ()
     """Names of scenes to do; empty: all."""
+    count: int | None = None
+    """How many runs, for benchmarks that fly or draw as many as wanted."""
     quick: bool = False
     """Less data, for a look; figures then say less."""
     tell: Callable[[str], None] = lambda _: None
