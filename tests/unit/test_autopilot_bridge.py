@@ -31,7 +31,7 @@ class Rig:
     """A bridge with an autopilot that is all switches; time in 10 ms ticks, a pose every 60 ms, guidance every 50."""
 
     def __init__(self, config: AutopilotConfig | None = None) -> None:
-        self.bridge = Bridge(config or AutopilotConfig())
+        self.bridge = Bridge(config or AutopilotConfig(check_parameters=False))
         self.now_ns = 1_700_000_000 * SECOND
         self.armed, self.mode = False, HOLD_MODE
         self.obedient = True

@@ -19,6 +19,7 @@ from services.navigator.autopilot import px4
 from services.navigator.autopilot.config import AutopilotConfig
 from services.navigator.autopilot.engagement import Engagement, Order, Vehicle
 from services.navigator.autopilot.frames import Mount, to_ned
+from services.navigator.autopilot.parameters import ParameterReader, refusals
 from services.navigator.autopilot.telemetry import Telemetry
 from services.navigator.autopilot.vision import Vision
 from services.navigator.track import Correction, Step
@@ -40,6 +41,7 @@ class Bridge:
         self.telemetry = Telemetry()
         self.vision = Vision(config, self.mount)
         self.engagement = Engagement(config)
+        self.parameters = ParameterReader(config.vehicle)
         self.setpoints_sent = 0
         self._corrections: dict[tuple[str, int], Correction] = {}
         """From the map as it was under (map_id, reset_counter) to the present one."""
@@ -71,7 +73,8 @@ class Bridge:
 
     def handle(self, message: Any, received_ns: int) -> None:  # noqa: ANN401 - pymavlink's classes share no typed base
         """Take a message of the autopilot. What others say on the link is not heard."""
-        self.telemetry.take(message, received_ns)
+        if self.telemetry.take(message, received_ns) and message.get_type() == "PARAM_VALUE":
+            self.parameters.take(message.param_id, message.param_value, message.param_type)
 
     # -- out ----------------------------------------------------------------------------------------------------
     def tick(self, now_ns: int) -> list[Any]:
@@ -84,6 +87,8 @@ class Bridge:
             return out
         if self._is_due("ask", now_ns, _ASK_AGAIN_NS):
             out.extend(self._requests(system, now_ns))
+        if self.config.check_parameters:
+            out.extend(self.parameters.due(system, now_ns))
         odometry = self.vision.message(now_ns)
         if odometry is not None:
             out.append(odometry)
@@ -101,7 +106,16 @@ class Bridge:
         """Return what the engagement looks at."""
         t = self.telemetry
         heard = t.age_s(now_ns) <= self.config.link_lost_s
-        return Vehicle(heard, t.armed, t.mode, t.landed == "on_ground", t.fused(now_ns))
+        return Vehicle(heard, t.armed, t.mode, t.landed == "on_ground", t.fused(now_ns), self.refusal())
+
+    def refusal(self) -> str:
+        """Return why the vehicle must not be flown, in words; empty when nothing speaks against it."""
+        if not self.config.check_parameters:
+            return ""
+        if not self.parameters.complete:
+            return "parameters are still being read"
+        wrong = refusals(self.parameters.found, self.config.vehicle)
+        return f"parameters: {'; '.join(wrong)}" if wrong else ""
 
     def state(self, now_ns: int) -> VehicleState:
         """Return the vehicle state for the bus."""
@@ -109,7 +123,7 @@ class Bridge:
         e = self.engagement
         return self.telemetry.state(
             now_ns, self._seq, connected=self.vehicle(now_ns).heard, override=e.override, mission_id=e.mission_id,
-            note=e.note,
+            note=e.note or self.refusal(),
         )  # fmt: skip
 
     def _is_due(self, what: str, now_ns: int, period_ns: int) -> bool:

@@ -16,6 +16,8 @@ class AutopilotConfig(BaseModel):
     """``udpin:HOST:PORT``, ``udpout:HOST:PORT``, ``tcp:HOST:PORT`` or ``serial:DEVICE:BAUD``."""
     vehicle: Literal["simulation", "real"] = "simulation"
     """Which parameters preflight asks for: on a real aircraft the sticks must win."""
+    check_parameters: bool = True
+    """Refuse to engage while a parameter that a flight rests on is not as it has to be."""
     system_id: int = Field(default=1, ge=1, le=255)
     """Ours until the autopilot's first heartbeat; then the autopilot's own."""
     component_id: int = Field(default=191, ge=1, le=255)

@@ -31,6 +31,8 @@ class Vehicle:
     mode: str
     on_ground: bool
     vision_fused: bool
+    refusal: str = ""
+    """Why this vehicle must not be flown: a parameter that is not as it has to be."""
 
 
 class Engagement:
@@ -99,10 +101,11 @@ class Engagement:
     def _stream(self, vehicle: Vehicle, now_ns: int) -> list[Order]:
         if self.usable(now_ns) is None:
             return self._cancel("the navigator took its order back", now_ns)
-        if self._elapsed_s(now_ns) >= self.config.stream_before_offboard_s and vehicle.vision_fused:
+        ready = vehicle.vision_fused and not vehicle.refusal
+        if ready and self._elapsed_s(now_ns) >= self.config.stream_before_offboard_s:
             self._go("switching", "asking for offboard", now_ns)
         elif self._elapsed_s(now_ns) > self.config.engage_timeout_s:
-            return self._cancel("the autopilot does not use the vision pose", now_ns)
+            return self._cancel(vehicle.refusal or "the autopilot does not use the vision pose", now_ns)
         return []
 
     def _switch(self, vehicle: Vehicle, now_ns: int) -> list[Order]:

@@ -78,8 +78,9 @@ def differences(found: Mapping[str, float], kind: VehicleKind) -> list[Differenc
     out = []
     for p in wanted(kind):
         value = found.get(p.name)
+        tolerance = 0.0 if p.integer else _RELATIVE_TOLERANCE
         fits = value is not None and any(
-            math.isclose(value, good, rel_tol=_RELATIVE_TOLERANCE, abs_tol=1e-9) for good in (p.value, *p.accepted)
+            math.isclose(value, good, rel_tol=tolerance) for good in (p.value, *p.accepted)
         )
         if not fits:
             out.append(Difference(p, value))
