@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 _EXIT_INTERRUPTED = 130
 _ROUTER_WITHIN_S = 20.0
 _LOOK_S = 0.2
-_SOURCES = frozenset({"camera", "simulator"})
 
 
 def run(
@@ -59,6 +58,7 @@ def run(
     flags = {"camera.source": source, "simulator.seed": seed, "simulator.scene": scene,
              "navigator.trees_wanted": trees, "navigator.handheld": True if handheld else None}  # fmt: skip
     tree = loaded(config, settings, port, {k: v for k, v in flags.items() if v is not None}).config
+    _check_source(tree)
     tree = with_port(tree, fixed=port is not None)
     tree = tree.model_copy(update={"clock": "sim" if tree.camera.source == "sim" else "wall"})
     return Run(tree, Console(stderr=True), logs, as_json=as_json).to_the_end()
@@ -69,6 +69,14 @@ def _refuse_unknown_autopilot(autopilot: str) -> None:
 
     if autopilot != "builtin":
         raise InputError(f"--autopilot {autopilot!r}: this version flies only the scripted path, give builtin")
+
+
+def _check_source(tree: TreedockConfig) -> None:
+    """Open a recording once before anything is started: the camera would find its faults half a minute later."""
+    if tree.camera.source not in {"sim", "realsense"}:
+        from services.camera.sources import open_source
+
+        open_source(tree.camera.source, tree.camera)
 
 
 def with_port(tree: TreedockConfig, *, fixed: bool) -> TreedockConfig:
@@ -118,15 +126,22 @@ class Run:
             InputError: a service refused its configuration or input; GoalNotReachedError: one could not be kept alive.
         """
         from services.cli.supervisor import Supervisor
+        from services.common.errors import InputError
         from services.common.logging import set_up
         from services.common.stop import StopSignal
 
         set_up("run", "warning" if self._console.is_terminal else self._tree.log_level)
         stop = StopSignal()
         stop.install(force=False)
-        supervisor = Supervisor(services_for(self._tree), self._spawn, self._tree.supervisor, last=_SOURCES)
+        # a recording does not wait for its consumers as the simulator does
+        last = frozenset[str]() if self._tree.camera.source == "sim" else frozenset({"camera"})
+        supervisor = Supervisor(services_for(self._tree), self._spawn, self._tree.supervisor, last)
         try:
             return self._supervised(supervisor, stop)
+        except InputError:
+            if stop.is_set:  # interrupted before the router was up
+                return _EXIT_INTERRUPTED
+            raise
         finally:
             supervisor.stop_all()
             if not self._keep_logs and supervisor.restarts == 0:

@@ -11,6 +11,7 @@ from services.camera.config import CameraConfig
 from services.cli.run_config import SupervisorConfig
 from services.detector.config import DetectorServiceConfig
 from services.detector.refine.config import RefinerConfig
+from services.mapper.config import MapperConfig
 from services.navigator.autopilot.config import AutopilotConfig
 from services.navigator.config import NavigatorConfig
 from services.router.config import RouterConfig
@@ -32,6 +33,7 @@ class TreedockConfig(BaseModel):
     supervisor: SupervisorConfig = SupervisorConfig()
     camera: CameraConfig = CameraConfig()
     slam: SlamConfig = SlamConfig()
+    mapper: MapperConfig = MapperConfig()
     detector: DetectorServiceConfig = DetectorServiceConfig()
     refiner: RefinerConfig = RefinerConfig()
     simulator: SimulatorConfig = SimulatorConfig()
