@@ -25,7 +25,7 @@ class KeyframeCloud:
 
 
 def pixel_rays(intrinsics: Intrinsics) -> Floats32:
-    """Return (H, W, 2): x/z and y/z of each pixel's ray, lens distortion removed."""
+    """Return (H, W, 2): x/z and y/z of each pixel's ray, lens distortion removed; NaN where there is none."""
     i = intrinsics
     u, v = np.meshgrid(np.arange(i.width, dtype=np.float64), np.arange(i.height, dtype=np.float64))
     if not i.distorted:
@@ -34,12 +34,19 @@ def pixel_rays(intrinsics: Intrinsics) -> Floats32:
 
     K = np.array([[i.fx, 0.0, i.cx], [0.0, i.fy, i.cy], [0.0, 0.0, 1.0]])
     pixels = np.stack([u.ravel(), v.ravel()], axis=1).reshape(-1, 1, 2)
-    rays = cv2.undistortPoints(pixels, K, np.array([i.k1, i.k2, i.p1, i.p2, i.k3]))
+    distortion = np.array([i.k1, i.k2, i.p1, i.p2, i.k3])
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-7)
+    rays = cv2.undistortPoints(pixels, K, distortion, criteria=criteria).reshape(-1, 2)
+    again, _ = cv2.projectPoints(np.hstack([rays, np.ones((len(rays), 1))]), np.zeros(3), np.zeros(3), K, distortion)
+    # far corners may lie where the model folds over: no ray leads there
+    rays[np.abs(again.reshape(-1, 2) - pixels.reshape(-1, 2)).max(axis=1) > 0.2] = np.nan
     return np.asarray(rays, dtype=np.float32).reshape(i.height, i.width, 2)
 
 
 @njit(cache=True, nogil=True)
-def _without_edges(depth: Floats32, near: float, far: float, floor: float, slope: float, out: Floats32) -> None:
+def _without_edges(
+    depth: Floats32, rays: Floats32, near: float, far: float, floor: float, slope: float, out: Floats32
+) -> None:
     """Copy depth in range that is not on a ramp between a nearer and a farther surface.
 
     A pixel mixed from both sides of an edge has a step on each side (within two pixels), one up and one down; the last
@@ -50,7 +57,7 @@ def _without_edges(depth: Floats32, near: float, far: float, floor: float, slope
         for u in range(width):
             out[v, u] = 0.0
             z = depth[v, u]
-            if not near <= z <= far:
+            if not near <= z <= far or np.isnan(rays[v, u, 0]):
                 continue
             limit = floor + slope * z * z
             mixed = False
@@ -72,7 +79,7 @@ def _without_edges(depth: Floats32, near: float, far: float, floor: float, slope
 
 @njit(cache=True, nogil=True)
 def _loneliness(depth: Floats32, rays: Floats32, slope: float, pitch: float, out: Floats32) -> tuple[float, float]:
-    """Fill each pixel's mean distance to its four nearest of the 8 neighbours two pixels away; return mean and deviation.
+    """Fill each pixel's mean distance to its (up to) four nearest of the 8 neighbours two pixels away; return mean and deviation.
 
     Distances are shares of what pixel pitch and noise lead one to expect, so that near and far compare.
     """
@@ -101,10 +108,10 @@ def _loneliness(depth: Floats32, rays: Floats32, slope: float, pitch: float, out
                         at -= 1
                     near[at] = d
                     k += 1
-            if k < 4:
+            if k < 3:
                 out[v, u] = np.inf
                 continue
-            share = 0.25 * (near[0] + near[1] + near[2] + near[3]) / (2.0 * pitch * z + slope * z * z)
+            share = np.mean(near[: min(k, 4)]) / (2.0 * pitch * z + slope * z * z)
             out[v, u] = share
             if share < 20.0:
                 total += share
@@ -171,11 +178,12 @@ def keyframe_cloud(
     slope = config.range_noise_per_m
     clean, lonely = np.empty_like(depth_m), np.empty_like(depth_m)
     _without_edges(
-        depth_m, config.min_range_m, config.max_range_m, config.edge_floor_m, config.edge_sigmas * slope, clean
+        depth_m, rays, config.min_range_m, config.max_range_m, config.edge_floor_m, config.edge_sigmas * slope, clean
     )
-    pitch = float(abs(rays[0, 1, 0] - rays[0, 0, 0]))
+    row, column = rays.shape[0] // 2, rays.shape[1] // 2
+    pitch = float(abs(rays[row, column, 0] - rays[row, column - 1, 0]))
     mean, deviation = _loneliness(clean, rays, slope, pitch, lonely)
-    limit = float(mean + config.outlier_sigmas * deviation)
+    limit = float(max(mean + config.outlier_sigmas * deviation, 2.0 * mean))  # the image's rim has fewer neighbours
     n = int(np.count_nonzero(clean))
     points, colours, counts = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n)
     colour = rgb if rgb is not None else np.zeros((*depth_m.shape, 3), dtype=np.uint8)

@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from services.common.geometry import level_camera
+from services.detector.config import DetectorServiceConfig
+from services.detector.identity import Identities
+from services.detector.map_store import anchor_of, moved_with
+from services.detector.model import Trunk
+
+
+def _trunk(x: float, y: float, radius: float = 0.1) -> Trunk:
+    return Trunk(
+        base_m=(x, y, 0.0), axis=(0.0, 0.0, 1.0), radius_m=radius, radius_height_m=1.3, taper=0.0, height_seen_m=3.0,
+        low_seen_m=0.3, sigma_xy_m=0.005, sigma_radius_m=0.002, arc_rad=2.0, confidence=0.9, layers=19, points=900,
+        noise_m=0.01, lean_rad=0.0, suitable=True, remark="",
+    )  # fmt: skip
+
+
+def _ids(identities: Identities) -> dict[int, tuple[float, float]]:
+    return {t.tree_id: t.trunk.base_m[:2] for t in identities.trees}
+
+
+def test_ids_stay_whatever_the_order() -> None:
+    ids = Identities(DetectorServiceConfig())
+    ids.update([_trunk(1, 0), _trunk(3, 0), _trunk(0, 4)])
+    first = _ids(ids)
+    ids.update([_trunk(0.03, 4.02), _trunk(1.02, 0), _trunk(3.01, 0.02)])
+    assert _ids(ids).keys() == first.keys()
+    for tree_id, place in _ids(ids).items():
+        assert np.hypot(place[0] - first[tree_id][0], place[1] - first[tree_id][1]) < 0.1
+    assert all(t.observations == 2 for t in ids.trees)
+
+
+def test_another_radius_is_another_tree_and_ids_are_never_used_again() -> None:
+    ids = Identities(DetectorServiceConfig(forget_after=1))
+    ids.update([_trunk(1, 0, 0.05)])
+    ids.update([_trunk(1.05, 0, 0.35)])
+    assert [t.tree_id for t in ids.trees] == [2]
+
+
+def test_forgotten_after_some_misses() -> None:
+    ids = Identities(DetectorServiceConfig(forget_after=2))
+    ids.update([_trunk(1, 0)])
+    ids.update([])
+    assert [t.missed for t in ids.trees] == [1]
+    ids.update([_trunk(1, 0)])
+    assert [(t.tree_id, t.missed) for t in ids.trees] == [(1, 0)]
+    ids.update([])
+    ids.update([])
+    assert ids.trees == []
+
+
+def test_close_trees_do_not_swap() -> None:
+    ids = Identities(DetectorServiceConfig())
+    ids.update([_trunk(1.0, 0.0), _trunk(1.35, 0.0)])
+    ids.update([_trunk(1.40, 0.0), _trunk(1.08, 0.0)])
+    assert _ids(ids) == {1: (1.08, 0.0), 2: (1.40, 0.0)}
+
+
+def test_a_tree_follows_the_submap_that_sees_it() -> None:
+    poses = {4: level_camera([0, 0, 1.5], 0.0), 5: level_camera([0, 0, 1.5], np.pi / 2)}
+    assert anchor_of(np.array([3.0, 0.2, 0.0]), poses) == 4
+    assert anchor_of(np.array([0.2, 3.0, 0.0]), poses) == 5
+    assert anchor_of(np.array([0.0, -9.0, 0.0]), poses) is None
+    turned = level_camera([0, 0, 1.5], 0.1)
+    moved = moved_with(np.array([3.0, 0.0, 0.0]), poses[4], turned)
+    assert moved == pytest.approx([3 * np.cos(0.1), 3 * np.sin(0.1), 0.0])
+
+
+def test_ids_follow_a_map_correction() -> None:
+    ids = Identities(DetectorServiceConfig())
+    ids.update([_trunk(4.0, 0.0), _trunk(4.0, 0.7)])
+    for t in ids.trees:  # a loop closes: everything turns by 0.15 rad, 0.6 m at 4 m
+        t.expected_m = moved_with(t.expected_m, level_camera([0, 0, 1.5], 0.0), level_camera([0, 0, 1.5], 0.15))
+    c, s = np.cos(0.15), np.sin(0.15)
+    ids.update([_trunk(4 * c, 4 * s), _trunk(4 * c - 0.7 * s, 4 * s + 0.7 * c)])
+    assert {t.tree_id: round(t.trunk.base_m[1], 2) for t in ids.trees} == {
+        1: round(4 * s, 2),
+        2: round(4 * s + 0.7 * c, 2),
+    }
