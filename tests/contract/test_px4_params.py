@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as m
 
+from services.common.errors import InputError
 from services.simulator.px4.params import INT32, NAMES, REAL32, VISION_SET, Parameters, integer_from_wire
 from tests.contract.px4_companion import Companion, quiet
 
@@ -80,8 +81,16 @@ def test_unknown_parameters_are_silent_and_unknown_overrides_are_told() -> None:
     c = Companion(quiet())
     set_param(c, "NO_SUCH_PARAM", REAL32, 1.0)
     assert not c.got["PARAM_VALUE"]
-    with pytest.raises(ValueError, match="NO_SUCH"):
+    with pytest.raises(InputError, match="NO_SUCH"):
         Parameters({"NO_SUCH": 1.0})
+    with pytest.raises(InputError, match="MPC_THR_HOVER"):
+        Parameters({"MPC_THR_HOVER": 0.0})
+
+
+def test_a_value_that_would_break_the_arithmetic_is_refused() -> None:
+    c = Companion(quiet())
+    set_param(c, "MPC_XY_P", REAL32, 0.0)
+    assert c.got["PARAM_VALUE"][-1][1].param_value == pytest.approx(0.95)
 
 
 @given(st.integers(min_value=-(2**31), max_value=2**31 - 1))

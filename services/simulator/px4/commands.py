@@ -24,6 +24,11 @@ class Command:
     params: tuple[float, float, float, float, float, float, float]
 
 
+def whole(value: float) -> int:
+    """Return a parameter that stands for an integer; -1 for what cannot be one."""
+    return int(value) if math.isfinite(value) and abs(value) < 2**31 else -1
+
+
 def _result(accepted: bool) -> int:
     return ACCEPTED if accepted else TEMPORARILY_REJECTED
 
@@ -37,9 +42,10 @@ def _arm_disarm(v: Vehicle, c: Command) -> int:
 
 
 def _set_mode(v: Vehicle, c: Command) -> int:
-    if not int(c.params[0]) & m.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
+    base, main, sub = (whole(v) for v in c.params[:3])
+    if base < 0 or not base & m.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
         return DENIED
-    state = BY_MODE.get((int(c.params[1]), int(c.params[2]) if int(c.params[1]) == NavState.HOLD.value[0] else 0))
+    state = BY_MODE.get((main, sub if main == NavState.HOLD.value[0] else 0))
     return _result(v.commander.request_mode(state)) if state is not None else DENIED
 
 

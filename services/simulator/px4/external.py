@@ -20,11 +20,14 @@ _VISION_TYPES = {
     m.MAV_ESTIMATOR_TYPE_VIO,
 }
 _FORCE = 512
+_FARTHEST_M = 1e5
+"""A vision position beyond this is refused: what it would do to the wire formats helps nobody."""
 _YAW, _YAW_RATE = 1024, 2048
 
 
 def _masked(values: tuple[float, float, float], mask: int, first_bit: int) -> Matrix:
-    return np.array([math.nan if mask & (first_bit << i) else v for i, v in enumerate(values)])
+    taken = (not mask & (first_bit << i) and math.isfinite(v) for i, v in enumerate(values))
+    return np.array([v if take else math.nan for v, take in zip(values, taken, strict=True)])
 
 
 def setpoint_from_target(message: Message, yaw_rad: float) -> tuple[Setpoint | None, str]:
@@ -75,6 +78,8 @@ def vision_from_odometry(message: Message, stamp_s: float) -> tuple[VisionSample
         return None, ""
     quaternion = np.array(message.q, dtype=float)
     if np.isfinite(quaternion).all() and abs(float(np.linalg.norm(quaternion)) - 1.0) > QUATERNION_NORM_TOLERANCE:
+        return None, ""
+    if np.abs(np.array([message.x, message.y, message.z])).max() > _FARTHEST_M:
         return None, ""
     told = message.estimator_type != m.MAV_ESTIMATOR_TYPE_NAIVE
     pose, speed = message.pose_covariance, message.velocity_covariance

@@ -11,7 +11,7 @@ from collections import defaultdict
 import numpy as np
 from pymavlink.dialects.v20 import common as m
 
-from services.simulator.px4.commands import ACCEPTED, FAILED, Command, execute
+from services.simulator.px4.commands import ACCEPTED, FAILED, Command, execute, whole
 from services.simulator.px4.external import setpoint_from_target, vision_from_odometry
 from services.simulator.px4.links import Link
 from services.simulator.px4.params import Parameter
@@ -23,6 +23,7 @@ _AUTOPILOT = m.MAV_COMP_ID_AUTOPILOT1
 _PARAM_BURST = 5
 _TEXT_BYTES = 50
 _SECOND_ACK_S = 0.02
+_MAX_LATITUDE_DEG = 89.0
 
 
 class Port:
@@ -52,7 +53,7 @@ class Port:
             return False
         default = RATES_HZ.get(ident)
         interval_s = interval_us * 1e-6 if interval_us > 0.0 else (1.0 / default if default else math.inf)
-        if interval_us < 0.0 or not math.isfinite(interval_s):
+        if not interval_us >= 0.0 or not math.isfinite(interval_s):
             self.intervals_s.pop(ident, None)
             return True
         self.intervals_s[ident], self.due_s[ident] = interval_s, now_s
@@ -198,12 +199,12 @@ class MavlinkServer:
     def _command(self, port: Port, message: Message, command: Command) -> None:
         ident, result = command.command, ACCEPTED
         if ident == m.MAV_CMD_SET_MESSAGE_INTERVAL:
-            good = port.set_interval(int(command.params[0]), command.params[1], self.vehicle.now_s)
+            good = port.set_interval(whole(command.params[0]), command.params[1], self.vehicle.now_s)
             result = ACCEPTED if good else FAILED
         elif ident in (m.MAV_CMD_REQUEST_MESSAGE, m.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES):
             wanted = m.MAVLINK_MSG_ID_AUTOPILOT_VERSION
             if ident == m.MAV_CMD_REQUEST_MESSAGE:
-                wanted = int(command.params[0])
+                wanted = whole(command.params[0])
             result = ACCEPTED if wanted in BUILDERS and self._tell(port, wanted) else FAILED
         elif ident == m.MAV_CMD_DO_SET_MODE:
             # the first acknowledgement says nothing: it is always "accepted" and comes before the decision
@@ -238,7 +239,11 @@ class MavlinkServer:
             port.timesync.update(now_s, message.ts1 * 1e-9, message.tc1 * 1e-9)
 
     def _on_origin(self, port: Port, message: Message) -> None:
-        self.vehicle.origin = (message.latitude * 1e-7, message.longitude * 1e-7, message.altitude * 1e-3)
+        latitude, longitude = message.latitude * 1e-7, message.longitude * 1e-7
+        if abs(latitude) > _MAX_LATITUDE_DEG or abs(longitude) > 180.0:
+            self.counters["origins_refused"] += 1
+            return
+        self.vehicle.origin = (latitude, longitude, message.altitude * 1e-3)
         self._tell(port, m.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
 
     def _on_mission_list(self, port: Port, message: Message) -> None:

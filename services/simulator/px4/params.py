@@ -11,6 +11,8 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from services.common.errors import InputError
+
 INT32, REAL32 = 6, 9
 """MAV_PARAM_TYPE of the two kinds that PX4 has."""
 
@@ -96,6 +98,18 @@ VISION_SET: dict[str, float] = {
 }
 """What design.md section 7 sets for flight on vision alone, in simulation."""
 
+_RANGES: dict[str, tuple[float, float]] = {
+    "EKF2_EVA_NOISE": (1e-4, 10.0),
+    "EKF2_EVP_NOISE": (1e-4, 100.0),
+    "EKF2_EVV_NOISE": (1e-4, 100.0),
+    "MPC_THR_HOVER": (0.1, 0.8),
+    "MPC_TILTMAX_AIR": (5.0, 80.0),
+    "MPC_XY_P": (0.05, 5.0),
+    "MPC_XY_VEL_MAX": (0.1, 50.0),
+    "MPC_Z_P": (0.05, 5.0),
+}
+"""Where arithmetic would break outside; PX4 leaves ranges to the ground station."""
+
 NAMES: tuple[str, ...] = tuple(sorted([*_INTEGERS, *_REALS]))
 
 
@@ -121,6 +135,11 @@ def integer_from_wire(field: float) -> int:
     return int(struct.unpack("<i", struct.pack("<f", field))[0])
 
 
+def _in_range(name: str, value: float) -> bool:
+    low, high = _RANGES.get(name, (-math.inf, math.inf))
+    return math.isfinite(value) and low <= value <= high
+
+
 class Parameters:
     """The parameter table; unknown names and wrong types are refused, as PX4 does, without a word."""
 
@@ -128,8 +147,9 @@ class Parameters:
         self._values: dict[str, float] = {**_INTEGERS, **_REALS, **VISION_SET}
         for name, value in (overrides or {}).items():
             if name not in self._values:
-                msg = f"simulator parameters: '{name}' is unknown; known are {', '.join(NAMES)}"
-                raise ValueError(msg)
+                raise InputError(f"simulator parameters: '{name}' is unknown; known are {', '.join(NAMES)}")
+            if not _in_range(name, value):
+                raise InputError(f"simulator parameters: {name} = {value:g} is outside {_RANGES.get(name)}")
             self._values[name] = value
 
     def __getitem__(self, name: str) -> float:
@@ -161,13 +181,13 @@ class Parameters:
         known = self.get(name)
         if known is None or kind != known.type:
             return None
-        if kind == REAL32 and not math.isfinite(field):
+        if kind == REAL32 and not _in_range(name, field):
             return None
         self._values[name] = float(integer_from_wire(field)) if kind == INT32 else float(field)
         return self.get(name)
 
     def set(self, name: str, value: float) -> None:
         """Store a value directly (tests and the shell of the simulator)."""
-        if name not in self._values:
-            raise KeyError(name)
+        if name not in self._values or not _in_range(name, value):
+            raise KeyError(f"{name} = {value:g}")
         self._values[name] = value
