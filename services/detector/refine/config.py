@@ -77,11 +77,17 @@ class FilterConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    gate: float = Field(default=4.0, gt=0.0)
+    gate: float = Field(default=5.0, gt=0.0)
     """Innovations beyond this many sigma are not believed."""
     image_x_accel_px_s2: float = Field(default=60.0, gt=0.0)
     """What the camera's known motion leaves unexplained."""
     range_accel_m_s2: float = Field(default=0.15, gt=0.0)
+    white_share: float = Field(default=0.15, gt=0.0, le=1.0)
+    """Share of a measurement's variance that is new in each frame: only this averages out. The rest (the sensor's
+    fixed pattern, bark, edges) stays and is added to what is published. Measured in simulation."""
+    pose_step_m: float = Field(default=0.003, ge=0.0)
+    """Standard deviation of the pose's error from frame to frame: it enters the prediction."""
+    pose_step_rad: float = Field(default=0.002, ge=0.0)
     blind_factor: float = Field(default=15.0, ge=1.0)
     """So many times larger are the accelerations while the camera's motion is not known."""
     radius_rate_m_s: float = Field(default=0.002, gt=0.0)

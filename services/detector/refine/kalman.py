@@ -9,6 +9,9 @@ import numpy as np
 from services.detector.refine.config import FilterConfig
 
 
+_MIN_RANGE_M = 0.3
+
+
 class Filter1D:
     """A quantity and its rate of change; filterpy does the sums.
 
@@ -35,12 +38,13 @@ class Filter1D:
         """Return its variance."""
         return float(self._kalman.P[0, 0])
 
-    def predict(self, dt_s: float, moved: float, acceleration: float) -> None:
+    def predict(self, dt_s: float, moved: float, moved_variance: float, acceleration: float) -> None:
         """Move on by ``dt_s``, during which the camera's motion changed the quantity by ``moved``."""
         kalman = self._kalman
         kalman.F = np.array([[1.0, dt_s], [0.0, 1.0]])
         gain = np.array([[0.5 * dt_s * dt_s], [dt_s]])
         kalman.Q = gain @ gain.T * acceleration**2
+        kalman.Q[0, 0] += moved_variance
         kalman.predict(u=np.array([[moved]]))
 
     def surprise(self, value: float, variance: float) -> float:
@@ -62,6 +66,7 @@ class TargetFilter:
         rates = (10.0 * config.image_x_accel_px_s2, config.range_accel_m_s2, config.radius_rate_m_s**2)
         self._filters = [Filter1D(*arguments) for arguments in zip(values, variances, rates, strict=True)]
         self._refused = 0
+        self._constant = tuple((1.0 - config.white_share) * v for v in variances)
 
     @property
     def values(self) -> tuple[float, float, float]:
@@ -71,18 +76,23 @@ class TargetFilter:
 
     @property
     def variances(self) -> tuple[float, float, float]:
-        """Return the variances of ``values``."""
-        x, distance, radius = (f.variance for f in self._filters)
+        """Return the variances of ``values``, with the part of the measurements' that does not average out."""
+        x, distance, radius = (f.variance + c for f, c in zip(self._filters, self._constant, strict=True))
         return x, distance, radius
 
-    def predict(self, dt_s: float, moved: tuple[float, float] | None) -> None:
+    def predict(self, dt_s: float, moved: tuple[float, float] | None, focal_px: float) -> None:
         """Move on; ``moved``: change of image x and range by the camera's motion, None when that is not known."""
         config = self._config
-        factor = 1.0 if moved is not None else config.blind_factor
-        x, distance = moved if moved is not None else (0.0, 0.0)
-        self._filters[0].predict(dt_s, x, config.image_x_accel_px_s2 * factor)
-        self._filters[1].predict(dt_s, distance, config.range_accel_m_s2 * factor)
-        self._filters[2].predict(dt_s, 0.0, config.radius_rate_m_s)
+        if moved is None:
+            self._filters[0].predict(dt_s, 0.0, 0.0, config.image_x_accel_px_s2 * config.blind_factor)
+            self._filters[1].predict(dt_s, 0.0, 0.0, config.range_accel_m_s2 * config.blind_factor)
+        else:
+            step = config.pose_step_m**2
+            turn = (focal_px * config.pose_step_rad) ** 2
+            across = step * (focal_px / max(self._filters[1].value, _MIN_RANGE_M)) ** 2
+            self._filters[0].predict(dt_s, moved[0], turn + across, config.image_x_accel_px_s2)
+            self._filters[1].predict(dt_s, moved[1], step, config.range_accel_m_s2)
+        self._filters[2].predict(dt_s, 0.0, 0.0, config.radius_rate_m_s)
 
     def update(self, values: tuple[float, float, float], variances: tuple[float, float, float]) -> bool:
         """Take in a measurement when it is believable; tell whether it was."""
@@ -91,8 +101,10 @@ class TargetFilter:
             self._refused += 1
             return False
         self._refused = 0
+        share = self._config.white_share
         for f, value, variance in triples:
-            f.update(value, variance)
+            f.update(value, variance * share)
+        self._constant = tuple((1.0 - share) * v for v in variances)
         return True
 
     @property

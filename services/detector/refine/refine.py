@@ -111,7 +111,7 @@ def _measurement(
     if axis_camera[2] < _MIN_DEPTH_M:
         return None
     covariance = J @ fit.covariance @ J.T
-    covariance += np.eye(3) * config.fit.systematic_m**2
+    covariance += _systematic(offset / distance, config.fit.systematic_m)
     to_polar = np.array([
         [-offset[1] / distance**2, offset[0] / distance**2, 0.0],
         [offset[0] / distance, offset[1] / distance, 0.0],
@@ -131,6 +131,17 @@ def _measurement(
         arc_rad=min(1.0, 0.5 * angle / half) * (math.pi - 2.0 * half), columns_px=columns, rows_px=rows,
         shift_m=(float(moved[0]), float(moved[1])),
     )  # fmt: skip
+
+
+def _systematic(away: Matrix, sigma_m: float) -> Matrix:
+    """Return the (3, 3) covariance of what more pixels do not average: mostly along the ray and in the radius.
+
+    Both silhouettes are seen, so across the ray a third of it remains (measured on simulated views).
+    """
+    along, across = sigma_m**2, (sigma_m / 3.0) ** 2
+    x, y = float(away[0]), float(away[1])
+    d = along - across
+    return np.array([[across + d * x * x, d * x * y, 0.0], [d * x * y, across + d * y * y, 0.0], [0.0, 0.0, along]])
 
 
 def axis_offset(parameters: Matrix, basis: Matrix) -> tuple[Matrix, Matrix]:

@@ -159,7 +159,7 @@ class RefinerTracker:
                 x, distance, _ = self._filter.values
                 now = float(project(in_camera[None], intrinsics)[0, 0])
                 moved = (now - x, float(np.hypot(offset[0], offset[1])) - distance)
-        self._filter.predict(dt_s, moved)
+        self._filter.predict(dt_s, moved, intrinsics.fx)
 
     def _measure(
         self, depth_m: Depth, intrinsics: Intrinsics, T: Matrix, covariance: Matrix | None, target: ExpectedTree

@@ -23,5 +23,5 @@ def warm() -> None:
     tree = ExpectedTree(0, 2.0, 0.0, 0.0, (0.0, 0.0, 1.0), 0.2, 0.05, 0.01)
     refine(depth, intrinsics, _LEVEL, np.eye(6) * 1e-4, tree, [], RefinerConfig())
     filters = TargetFilter((0.0, 2.0, 0.1), (1.0, 1e-4, 1e-4), RefinerConfig().filter)
-    filters.predict(0.1, (0.0, 0.0))
+    filters.predict(0.1, (0.0, 0.0), 50.0)
     filters.update((0.0, 2.0, 0.1), (1.0, 1e-4, 1e-4))
