@@ -23,7 +23,7 @@ from services.navigator.board import Event, Inputs, Outputs, Seen
 from services.navigator.config import NavigatorConfig
 from services.navigator.mission import Mission
 from services.simulator.px4.config import Px4Config, WindConfig
-from services.simulator.px4.links import LoopbackLink
+from services.simulator.px4.inprocess import InProcessLink
 from services.simulator.px4.simulated import SimulatedPx4
 
 TICK_NS = 10_000_000
@@ -68,11 +68,10 @@ class Flight:
         T = pose(np.eye(3), (0.0, 0.0, 0.1))
         config = Px4Config(wind=self.case.wind)
         self.px4 = SimulatedPx4(_flat, T, config, int(rng.integers(2**31)))
-        theirs, self._link = LoopbackLink.pair()
-        self.px4.attach(theirs)
         self.mission = Mission(self.case.navigator)
         self.bridge = Bridge(self.case.autopilot)
         self.codec = Codec(self.case.autopilot.component_id, 1, lambda: self.now_ns)
+        self._link = InProcessLink(self.px4, self.codec)
         T_world_map = pose(np.eye(3), self._camera()[:3, 3])
         self.chain = SyntheticChain(self.case.trunks, T_world_map, self.case.errors, rng)
         self._T_world_map = T_world_map
@@ -142,16 +141,14 @@ class Flight:
             self._trees = Seen(message, self.now_ns)
 
     def _run_bridge(self) -> None:
-        while (data := self._link.receive()) is not None:
-            if self.bridge_alive:
-                for message, received_ns in self.codec.take(data, self._link.send):
-                    self.bridge.handle(message, received_ns)
         if not self.bridge_alive:
             return
+        for message, received_ns in self._link.poll():
+            self.bridge.handle(message, received_ns)
         for message in self.bridge.tick(self.now_ns):
             if message.get_type() == "SET_POSITION_TARGET_LOCAL_NED":
                 self.setpoints.append((self.now_ns, message))
-            self._link.send(self.codec.pack(message))
+            self._link.send(message)
         if self._ticks % 5 == 0:
             self._vehicle = Seen(self.bridge.state(self.now_ns), self.now_ns)
 

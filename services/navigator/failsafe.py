@@ -100,7 +100,7 @@ def _operator(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
     if v is None:
         return None
     if v.operator_override:
-        return Fault("operator", "release", f"operator took over: mode {v.mode}; we are silent")
+        return Fault("operator", "release", f"operator took over: {v.note or v.mode}; we are silent")
     if not w.armed or doing == "landing":
         return None
     if not v.armed:

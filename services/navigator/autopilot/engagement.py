@@ -170,7 +170,11 @@ class Engagement:
         return []
 
     def _release(self, vehicle: Vehicle, now_ns: int) -> list[Order]:
-        self._go("released", f"mode {vehicle.mode}, not by us: the pilot has the aircraft", now_ns)
+        self._go(
+            "released",
+            f"mode {vehicle.mode}, not by us: the pilot has the aircraft, or PX4 acts by its own failsafe",
+            now_ns,
+        )
         return []
 
     def _cancel(self, note: str, now_ns: int) -> list[Order]:

@@ -1,0 +1,105 @@
+"""Flights without rendering: mission, bridge and simulated PX4 in one loop, and what happens when a part fails."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from services.evaluate.flight import Flight, random_case
+from services.navigator.autopilot.bridge import Bridge
+from services.navigator.mission import Mission
+from services.simulator.px4.modes import NavState
+
+SEED = 5
+
+
+def _flying(state: str, seed: int = SEED) -> Flight:
+    flight = Flight(random_case(seed))
+    flight.start()
+    assert flight.run((state,)) == state, flight.mission.reason  # type: ignore[arg-type]
+    return flight
+
+
+def _ticks(flight: Flight, seconds: float) -> None:
+    for _ in range(round(seconds * 100)):
+        flight.tick()
+
+
+def _speed(flight: Flight) -> float:
+    before = flight.px4.true_pose()[:3, 3].copy()
+    _ticks(flight, 0.5)
+    return float(np.linalg.norm(flight.px4.true_pose()[:3, 3] - before)) / 0.5
+
+
+@pytest.mark.parametrize("seed", [5, 6])
+def test_docks_and_lands(seed: int) -> None:
+    flight = _flying("docked", seed)
+    distance, bearing = flight.dock_errors[0]
+    assert 0.85 <= distance <= 1.0
+    assert abs(bearing) <= np.radians(3.0)
+    assert flight.run(("landed",), 60.0) == "landed"
+    assert flight.touches == 0
+    assert not flight.px4.armed
+
+
+def test_the_pilot_takes_over_in_the_approach() -> None:
+    flight = _flying("approach")
+    _ticks(flight, 2.0)
+    flight.px4.pilot_takes(NavState.POSITION)
+    taken_ns = flight.now_ns
+    _ticks(flight, 10.0)
+    assert flight.state == "released"
+    last_ns = flight.setpoints[-1][0]
+    assert (last_ns - taken_ns) / 1e9 < 0.25
+    assert flight.px4.mode is NavState.POSITION
+    assert flight.order("start"), "a start in the air must be refused"
+
+
+def test_slam_lost_for_long_lands() -> None:
+    flight = _flying("approach")
+    flight.chain.slam_lost = True
+    _ticks(flight, 0.5)
+    assert flight.state == "hold"
+    # EKF2_NOAID_TOUT is 1 s: PX4 lands by its own failsafe before our hold has run out
+    assert flight.run((), 60.0) in ("landed", "released")
+    _ticks(flight, 20.0)
+    assert not flight.px4.armed
+    assert flight.px4.on_ground
+    assert flight.touches == 0
+
+
+def test_navigator_killed_the_bridge_holds_and_a_new_one_lands() -> None:
+    flight = _flying("approach")
+    _ticks(flight, 3.0)
+    flight.navigator_alive = False
+    _ticks(flight, 2.0)
+    assert _speed(flight) < 0.25  # wind
+    flight.mission = Mission(flight.case.navigator)
+    flight.navigator_alive = True
+    _ticks(flight, 0.3)
+    assert flight.state == "hold"
+    assert flight.run((), 60.0) == "landed"
+    assert not flight.px4.armed
+
+
+def test_navigator_killed_for_good_the_bridge_lands() -> None:
+    flight = _flying("approach")
+    flight.navigator_alive = False
+    _ticks(flight, 40.0)
+    assert not flight.px4.armed
+    assert flight.touches == 0
+
+
+def test_bridge_killed_px4_lands_and_a_new_bridge_stays_silent() -> None:
+    flight = _flying("approach")
+    flight.bridge_alive = False
+    _ticks(flight, 1.0)
+    flight.bridge = Bridge(flight.case.autopilot)
+    before = len(flight.setpoints)
+    flight.bridge_alive = True
+    _ticks(flight, 40.0)
+    assert len(flight.setpoints) == before
+    assert not flight.px4.armed
+    assert flight.state in ("released", "landed")
+    _ticks(flight, 10.0)
+    assert not flight.px4.armed
