@@ -5,7 +5,7 @@ import pytest
 
 from schemas.mapping import Submap
 from schemas.topics import MAP_CLOUD, TREES_LIST
-from schemas.trees import TreeList
+from schemas.trees import Tree, TreeList
 from services.common.config import TreedockConfig
 from services.common.geometry import inverse, level_camera
 from services.common.memory import Hub
@@ -106,5 +106,5 @@ def test_withdrawn_and_new_maps() -> None:
     assert system.lists[-1].map_id == "m2"
     assert len(system.lists[-1].trees) == 0
     system.send(_submap(_forest(2), submap_id=2, map_id="m2"))
-    newest = system.lists[-1].trees
+    newest: tuple[Tree, ...] = system.lists[-1].trees
     assert [t.id for t in newest] == [3, 4], "ids of an old map are not given again"

@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from services.cli.app import invoke
+from tests.unit.detector_clouds import Floats, ground, trunk
+
+
+@pytest.fixture
+def forest(tmp_path: Path) -> Path:
+    rng = np.random.default_rng(1)
+    cloud = np.concatenate([ground(3.0), trunk(1.5, 0.0, 0.1, rng), trunk(-1.0, 1.0, 0.3, rng)])
+    path = tmp_path / "forest.xyz"
+    np.savetxt(path, cloud, fmt="%.4f")
+    return path
+
+
+def _save(path: Path, cloud: Floats) -> Path:
+    np.savetxt(path, cloud, fmt="%.4f")
+    return path
+
+
+def test_writes_trees_json(forest: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "trees.json"
+    assert invoke(["detect", str(forest), "--out", str(out), "--up", "0,0,1"]) == 0
+    told = json.loads(out.read_text())
+    assert told["frame"] == "input"
+    assert [t["suitable"] for t in told["trees"]] == [False, True]
+    keys = {
+        "id",
+        "x_m",
+        "y_m",
+        "z_m",
+        "axis",
+        "radius_m",
+        "radius_height_m",
+        "height_seen_m",
+        "sigma_xy_m",
+        "sigma_radius_m",
+    }
+    keys |= {"arc_rad", "confidence", "observations", "suitable"}
+    assert all(set(t) == keys for t in told["trees"])
+    assert "2 trees" in capsys.readouterr().out
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["forest.xyz", "trees.json"]
+
+
+def test_json_on_stdout_finds_the_vertical(forest: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    swapped = _save(tmp_path / "swapped.xyz", np.loadtxt(forest)[:, [1, 2, 0]])
+    assert invoke(["detect", str(swapped), "--json", "--explain"]) == 0
+    said = capsys.readouterr()
+    told = json.loads(said.out)
+    assert told["up"] == [0.0, 1.0, 0.0]
+    assert len(told["trees"]) == 2
+    assert isinstance(told["dropped"], list)
+    assert "vertical 0,1,0" in said.err
+
+
+def test_no_trees_is_a_result(tmp_path: Path) -> None:
+    out = tmp_path / "trees.json"
+    assert invoke(["detect", str(_save(tmp_path / "flat.xyz", ground(2.0))), "--out", str(out)]) == 0
+    assert json.loads(out.read_text()) == {"frame": "input", "trees": []}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["{}/none.ply"], "no such file"), (["{}/cut.pcd"], "cut short"), (["{}/nan.xyz"], "NaN"),
+        (["{}/good.xyz", "--up", "0,0"], "--up"), (["{}/good.xyz", "--up", "0,0,0"], "--up"),
+        (["{}/good.xyz", "--method", "magic"], "magic"), (["{}/good.xyz", "--out", "{}/no/trees.json"], "does not exist"),
+        (["{}/good.xyz", "--out", "{}"], "is a folder"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line_and_exit_2(
+    arguments: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _save(tmp_path / "good.xyz", ground(1.0))
+    _save(tmp_path / "nan.xyz", np.full((100, 3), np.nan))
+    head = "VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 100\nHEIGHT 1\nPOINTS 100\nDATA binary\n"
+    (tmp_path / "cut.pcd").write_bytes(head.encode() + bytes(500))
+    before = sorted(p.name for p in tmp_path.iterdir())
+    assert invoke(["detect", *(a.format(tmp_path) for a in arguments)]) == 2
+    said = capsys.readouterr()
+    assert words in said.err
+    assert said.err.count("\n") == 1
+    assert said.out == ""
+    assert sorted(p.name for p in tmp_path.iterdir()) == before, "something half-written was left"
