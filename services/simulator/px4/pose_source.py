@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from services.common.geometry import R_BODY_CAMERA, Matrix, pose
 from services.simulator.px4.frames import world_from_ned
 from services.simulator.px4.simulated import SimulatedPx4
+
+SLICE_S = 0.008
+"""Below TIMESYNC's ten milliseconds, so that an answer given between two slices still counts."""
 
 
 def body_camera(offset_m: tuple[float, float, float]) -> Matrix:
@@ -18,7 +23,11 @@ def body_camera(offset_m: tuple[float, float, float]) -> Matrix:
 
 
 class FlyingCamera:
-    """Carries the camera where the autopilot flies. ``advance`` lets simulated time pass."""
+    """Carries the camera where the autopilot flies. ``advance`` lets simulated time pass, slice by slice.
+
+    ``between(elapsed_s)`` is called after each slice with the simulated time since the start: publish the clock there
+    and let a companion in another process take its turn. Without it a whole frame passes unheard: 70 ms more delay.
+    """
 
     scripted = False
 
@@ -26,10 +35,12 @@ class FlyingCamera:
         self,
         px4: SimulatedPx4,
         offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        between: Callable[[float], None] | None = None,
         end_after_landing_s: float = 3.0,
     ) -> None:
         self.px4 = px4
         self._T_body_camera = body_camera(offset_m)
+        self._between = between
         self._end_after_landing_s = end_after_landing_s
         self._acceleration = np.zeros(3)
         self._flown = False
@@ -51,7 +62,13 @@ class FlyingCamera:
     def advance(self, dt_s: float) -> Matrix:
         """Let ``dt_s`` pass and return ``T_world_camera``."""
         before = self._velocity()
-        self.px4.step(dt_s)
+        left_s = dt_s
+        while left_s > 1e-9:
+            slice_s = min(SLICE_S, left_s)
+            self.px4.step(slice_s)
+            left_s -= slice_s
+            if self._between is not None:
+                self._between(self.px4.elapsed_s)
         self._acceleration = (self._velocity() - before) / dt_s
         self._flown = self._flown or not self.px4.on_ground
         parked = self._flown and self.px4.on_ground and not self.px4.armed
