@@ -35,7 +35,7 @@ class SearchConfig(BaseModel):
     gate_sigmas: float = Field(default=3.0, gt=0.0)
     min_gate_m: float = Field(default=0.20, gt=0.0)
     max_gate_m: float = Field(default=0.70, gt=0.0)
-    rows: int = Field(default=56, ge=8)
+    rows: int = Field(default=48, ge=8)
     """Image rows read in the window, evenly spread."""
     max_spread_m: float = Field(default=0.5, gt=0.0)
     """Largest spread of range in one object (the reference's figure)."""
@@ -49,7 +49,7 @@ class FitConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    max_points: int = Field(default=1200, ge=100)
+    max_points: int = Field(default=800, ge=100)
     min_points: int = Field(default=40, ge=10)
     iterations: int = Field(default=12, ge=3)
     tukey: float = Field(default=4.0, gt=1.0)

@@ -8,7 +8,6 @@ import numpy as np
 
 from services.detector.refine.config import FilterConfig
 
-
 _MIN_RANGE_M = 0.3
 
 

@@ -249,7 +249,7 @@ def fit_trunk(
         for i in range(PARAMETERS):
             p[i] -= factor * step[i]
         p[2] = max(p[2], 0.005)
-        if largest < 2e-5 and iteration > 5:
+        if largest < 1e-4 and iteration >= 5:
             break
     for i in range(PARAMETERS):
         for j in range(i):
