@@ -63,6 +63,7 @@ class Bus:
         self._last_seq: dict[str, int] = {}
         self._throttle = Throttle()
         self._boxes: dict[str, Mailbox] = {}
+        self._live: set[str] | None = None
 
     # -- sending
 
@@ -258,6 +259,23 @@ class Bus:
     def declare_live(self, service: str) -> None:
         """Show the liveliness token ``live/{service}`` for as long as the session lives."""
         self._kept.append(self.session.liveliness().declare_token(f"{PREFIX}/{self.uav}/live/{service}"))
+
+    def alive(self, service: str) -> bool:
+        """Return whether a service's token stands; the first call begins to watch (and knows those already there)."""
+        if self._live is None:
+            self._live = set(self.live_services())
+            watcher: zenoh.handlers.Callback[zenoh.Sample] = zenoh.handlers.Callback(self._on_token, indirect=False)
+            key = f"{PREFIX}/{self.uav}/live/*"
+            self._kept.append(self.session.liveliness().declare_subscriber(key, watcher, history=True))
+        return service in self._live
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        assert self._live is not None
+        name = str(sample.key_expr).rsplit("/", 1)[-1]
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._live.add(name)
+        else:
+            self._live.discard(name)
 
     def live_services(self, timeout_s: float = 0.5) -> list[str]:
         """Return the names of the services that are live now, sorted."""

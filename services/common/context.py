@@ -87,6 +87,10 @@ class Context(Protocol):
         """Return whether anybody subscribes to the topic now: for what is only made when somebody wants it."""
         ...
 
+    def alive(self, service: str) -> bool:
+        """Return whether the service's liveliness token stands: gone within milliseconds of its death, hung or not."""
+        ...
+
     def answer(self, topic: Topic, kind: type[Q], handler: Callable[[Q], Wire | None], leaf: str | None = None) -> None:
         """Answer queries on ``topic``'s key: the request is decoded as ``kind``; None gives no reply."""
         ...

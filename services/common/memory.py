@@ -43,9 +43,12 @@ class Hub:
     _states: dict[str, Callable[[], list[Wire]]] = field(default_factory=dict)
     _timers: list[_Timer] = field(default_factory=list)
     _at_stop: list[Callable[[], None]] = field(default_factory=list)
+    live: set[str] = field(default_factory=set)
+    """Services that have a context here; a test takes one out to have it dead."""
 
     def context(self, service: str) -> MemoryContext:
         """Return a context for one service."""
+        self.live.add(service)
         return MemoryContext(self, service)
 
     def run(self) -> None:
@@ -104,6 +107,10 @@ class MemoryContext:
     def listened(self, topic: Topic, leaf: str | None = None) -> bool:
         """Return whether a handler is registered for the key."""
         return topic.key(self.uav, leaf) in self._hub._handlers  # noqa: SLF001
+
+    def alive(self, service: str) -> bool:
+        """Return whether the service is among the hub's living."""
+        return service in self._hub.live
 
     def publish(self, topic: Topic, message: Wire, leaf: str | None = None) -> None:
         """Queue a message for its handlers."""

@@ -105,6 +105,10 @@ class LiveContext:
         """Return whether anybody subscribes now."""
         return self.bus.listened(topic, leaf)
 
+    def alive(self, service: str) -> bool:
+        """Return whether the service's token stands."""
+        return self.bus.alive(service)
+
     def answer(self, topic: Topic, kind: type[Q], handler: Callable[[Q], Wire | None], leaf: str | None = None) -> None:
         """Answer queries that carry a ``kind``."""
         self.bus.answer(topic, kind, handler, leaf)

@@ -6,6 +6,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from services.simulator.px4.config import LinkConfig, Px4Config
+
 
 class SensorConfig(BaseModel):
     """The camera's faults: an active stereo camera outdoors, and a cheap accelerometer."""
@@ -48,6 +50,34 @@ class PathConfig(BaseModel):
     """Amplitude of roll and pitch."""
 
 
+class FlightConfig(BaseModel):
+    """How simulated time runs while the loop is closed."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    lead_s: float = Field(default=0.1, gt=0.0, le=1.0)
+    """Simulated time is at most so far ahead of what autopilot and navigator said last."""
+    hung_after_s: float = Field(default=2.0, gt=0.0)
+    """Wall time after which time goes on without a living service that does not answer, until it does."""
+    max_speed: float = Field(default=2.0, gt=0.0, le=20.0)
+    """Simulated seconds per second at most; 1 at most while a service is missing."""
+    limit_s: float = Field(default=600.0, gt=0.0)
+    """Simulated time after which the flight is broken off."""
+
+
+class ExternalConfig(BaseModel):
+    """A PX4 that runs elsewhere, in real time; its true pose carries our camera."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    endpoint: str = "udpin:127.0.0.1:14540"
+    """Where that PX4 speaks MAVLink: ``udpin:HOST:PORT`` listens, ``udpout:HOST:PORT`` speaks first."""
+    bridge: str = "udpout:127.0.0.1:14541"
+    """Where our autopilot bridge listens: it gets everything but the truth."""
+    truth_rate_hz: float = Field(default=50.0, ge=10.0, le=250.0)
+    truth_silent_s: float = Field(default=1.0, gt=0.0)
+
+
 class SimulatorConfig(BaseModel):
     """The simulator service."""
 
@@ -62,7 +92,11 @@ class SimulatorConfig(BaseModel):
     clock_rate_hz: float = Field(default=100.0, gt=0.0, le=1000.0)
     reduced: bool = False
     """Render 320x240 and scale up: for slow machines."""
-    mode: Literal["scan"] = "scan"
+    mode: Literal["flight", "scan", "external"] = "flight"
+    """flight: on the simulated aircraft; scan: on the scripted path; external: on the aircraft of another simulator."""
+    flight: FlightConfig = FlightConfig()
+    px4: Px4Config = Px4Config(links=(LinkConfig(),))
+    external: ExternalConfig = ExternalConfig()
     answer_timeout_s: float = Field(default=10.0, gt=0.0)
     """Wall time that slam and refiner have for a frame before simulated time goes on without them."""
     body_radius_m: float = Field(default=0.25, gt=0.0)

@@ -16,13 +16,16 @@ class Touches:
         self.smallest_m = math.inf
         """Smallest clearance since take-off; before that the present one."""
 
-    def update(self, clearance_m: float) -> None:
-        """Take the present distance from the aircraft's centre to the nearest surface."""
+    def update(self, clearance_m: float, *, bumped: bool = False) -> None:
+        """Take the present distance from the aircraft's centre to the nearest surface.
+
+        ``bumped``: it hit the ground although it was not landing.
+        """
         if not self._airborne:
             self._airborne = clearance_m > self._radius_m
             self.smallest_m = clearance_m
             return
         self.smallest_m = min(self.smallest_m, clearance_m)
-        touching = clearance_m < self._radius_m
+        touching = bumped or clearance_m < self._radius_m
         self.count += touching and not self._touching
         self._touching = touching

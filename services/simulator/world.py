@@ -40,6 +40,8 @@ class World:
         self._core = o3d.core
         self._caster: Any = o3d.t.geometry.RaycastingScene(nthreads=1)
         self._solid: Any = o3d.t.geometry.RaycastingScene(nthreads=1)
+        self._things: Any = o3d.t.geometry.RaycastingScene(nthreads=1)
+        things = 0
         materials: list[int] = []
         trees: list[int] = []
         for mesh, material, tree in _parts(scene):
@@ -48,9 +50,13 @@ class World:
             self._caster.add_triangles(vertices, triangles)
             if material != BACKDROP:
                 self._solid.add_triangles(vertices, triangles)
+            if material not in {BACKDROP, GROUND}:
+                self._things.add_triangles(vertices, triangles)
+                things += 1
             materials.append(material)
             trees.append(tree)
         self.scene = scene
+        self._empty = things == 0
         self.material = np.array(materials, dtype=np.int64)
         """Material of each part (texture.py)."""
         self.tree_of_part = np.array(trees, dtype=np.int64)
@@ -63,8 +69,15 @@ class World:
 
     def clearance(self, position_m: Floats) -> float:
         """Return the distance from a point in the world to the nearest surface, metres."""
+        return self._distance(self._solid, position_m)
+
+    def clearance_of_things(self, position_m: Floats) -> float:
+        """Return the distance to the nearest thing that stands on the ground, infinite in an empty scene."""
+        return np.inf if self._empty else self._distance(self._things, position_m)
+
+    def _distance(self, scene: Any, position_m: Floats) -> float:  # noqa: ANN401  # open3d has no types
         query = self._core.Tensor.from_numpy(np.asarray(position_m, dtype=np.float32).reshape(1, 3))
-        return float(self._solid.compute_distance(query, nthreads=1).numpy()[0])
+        return float(scene.compute_distance(query, nthreads=1).numpy()[0])
 
     def touches(self, position_m: Floats, radius_m: float) -> bool:
         """Return whether a ball around ``position_m`` reaches into anything."""

@@ -18,7 +18,7 @@ from services.common.context import Context
 from services.common.memory import Hub
 from services.simulator.config import PathConfig, SimulatorConfig
 from services.simulator.lockstep import Lockstep
-from services.simulator.service import Simulator
+from services.simulator.scan import Scan
 
 QUICK = PathConfig(rest_s=0.2, turn_rate_rad_s=2.0, speed_m_s=4.0, hold_s=0.2)
 CONFIG = SimulatorConfig(scene="single-01", reduced=True, rate_hz=3.0, path=QUICK)
@@ -39,7 +39,7 @@ class Bench:
         self.others.on(SIM_RGBD, self._on_frame)
         self.others.on(SIM_CLOCK, self.clocks.append)
         self.others.on(SIM_TRUTH, self.truths.append)
-        self.simulator = Simulator(cast(Context, self.context), config, wall=lambda: self.now_s)
+        self.simulator = Scan(cast(Context, self.context), config, wall=lambda: self.now_s)
 
     def _on_frame(self, frame: RgbdFrame) -> None:
         self.frames.append(frame)
