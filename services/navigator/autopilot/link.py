@@ -56,7 +56,11 @@ class UdpWire:
         self._socket.settimeout(_WAIT_S)
         self._peer: tuple[str, int] | None = None if listen else (host, port)
         if listen:
-            self._socket.bind((host, port))
+            try:
+                self._socket.bind((host, port))
+            except (OSError, OverflowError):
+                self._socket.close()
+                raise
 
     def read(self) -> bytes:
         """Return the next datagram, empty after a short wait."""
