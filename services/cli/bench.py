@@ -20,6 +20,10 @@ DataFolder = Annotated[
 ]
 ResumeFolder = Annotated[Path, typer.Option("--out", help="Folder for results to resume from")]
 
+KeepSequences = Annotated[
+    bool, typer.Option("--keep-sequences", help="Keep rendered scenes for later calls (150 MB each)")
+]
+
 
 def bench(
     name: Annotated[str, typer.Argument(help="catalogue, detection, slam, refine, depth, missions, system ...")],
@@ -31,6 +35,7 @@ def bench(
     count: Annotated[int | None, typer.Option("--count", min=1, help="How many runs (missions)")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Less data: a look, not a measurement")] = False,
     doc: Annotated[Path | None, typer.Option("--doc", help="Put the result into this Markdown file")] = None,
+    keep_sequences: KeepSequences = False,
     as_json: AsJson = False,
 ) -> None:
     """Run a benchmark and print its table and figures."""
@@ -39,7 +44,7 @@ def bench(
 
     run = load_bench(name)
     options = BenchOptions(
-        seed=seed, out=out, scenes=tuple(part.strip() for part in scenes.split(",") if part.strip()), quick=quick, count=count,
+        seed=seed, out=out, scenes=tuple(part.strip() for part in scenes.split(",") if part.strip()), quick=quick, keep_sequences=keep_sequences, count=count,
         tell=lambda line: typer.echo(line, err=True), **({"data": data} if data is not None else {}),
     )  # fmt: skip
     report = run(options)

@@ -43,6 +43,8 @@ class BenchOptions:
     """How many runs, for benchmarks that fly or draw as many as wanted."""
     quick: bool = False
     """Less data, for a look; figures then say less."""
+    keep_sequences: bool = False
+    """Keep what was rendered, for the next call with the same simulator (150 MB a scene)."""
     tell: Callable[[str], None] = lambda _: None
     """Progress, one line at a time."""
 
@@ -83,15 +85,20 @@ def machine() -> str:
     return f"{model}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, Python {platform.python_version()}"
 
 
-def code_version(packages: tuple[str, ...]) -> str:
-    """Return a hash over the source files of packages (dotted names): results of other code are not reused."""
+def code_version(names: tuple[str, ...]) -> str:
+    """Return a hash over the source files of packages and modules (dotted names).
+
+    Results of other code are not reused.
+    """
     digest = hashlib.sha256()
-    for package in packages:
-        spec = find_spec(package)
-        folders = list(spec.submodule_search_locations or []) if spec else []
-        for folder in folders:
-            for path in sorted(Path(folder).rglob("*.py")):
-                digest.update(str(path.relative_to(folder)).encode() + b"\0" + path.read_bytes())
+    for name in names:
+        spec = find_spec(name)
+        if spec is None or spec.origin is None:
+            continue
+        folders = [Path(folder) for folder in spec.submodule_search_locations or ()]
+        paths = sorted(path for folder in folders for path in folder.rglob("*.py")) or [Path(spec.origin)]
+        for path in paths:
+            digest.update(f"{name}/{path.name}".encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,10 @@ from services.common.config import TreedockConfig
 from services.evaluate.bench import BenchOptions, BenchReport, code_version
 from services.evaluate.trees import Score, read_trees, read_truth, rmse, score
 
+_SIMULATOR = ("services.simulator", "services.common.geometry")
 _CODE = (
-    "schemas", "services.camera", "services.slam", "services.mapper", "services.detector", "services.simulator",
-    "services.evaluate",
+    "schemas", "services.common", "services.camera", "services.slam", "services.mapper", "services.detector", *_SIMULATOR,
+    "services.evaluate.offline", "services.evaluate.trees", "services.evaluate.bench_catalogue",
 )  # fmt: skip
 RATE_HZ = 15.0
 FRESH_PER_KIND = 10
@@ -46,24 +47,19 @@ def run(options: BenchOptions, config: TreedockConfig | None = None) -> BenchRep
         key = json.dumps({"scene": name, **settings}, sort_keys=True)
         row = done.get(key)
         if row is None:
-            row = run_scene(name, config, options.out / "scenes" / name, reduced=options.quick)
+            row = run_scene(name, config, options)
             _append(options.out / "catalogue.jsonl", {"key": key, **row})
         options.tell(f"{number}/{len(names)} {line_of(row)}")
         rows.append(row)
     return _report(rows, config, options, version)
 
 
-def run_scene(name: str, config: TreedockConfig, keep: Path, *, reduced: bool = False) -> dict[str, Any]:
-    """Render a scene, process it, keep the results in ``keep``, and return its row."""
+def run_scene(name: str, config: TreedockConfig, options: BenchOptions) -> dict[str, Any]:
+    """Render a scene, process it, keep the results under ``options.out``, and return its row."""
     from services.evaluate.sequence import process_sequence
-    from services.simulator.catalogue import scene_by_name
-    from services.simulator.write import write_sequence
 
-    with tempfile.TemporaryDirectory(prefix="treedock-scene-") as folder:
-        sequence = Path(folder)
-        begin = time.perf_counter()
-        frames = write_sequence(scene_by_name(name), sequence, rate_hz=RATE_HZ, reduced=reduced)
-        rendered_s = time.perf_counter() - begin
+    keep = options.out / "scenes" / name
+    with _rendered(name, options) as sequence:
         values = process_sequence(sequence, keep, config)
         for extra in ("truth.json", "groundtruth.txt"):
             shutil.copy(sequence / extra, keep / extra)
@@ -72,13 +68,32 @@ def run_scene(name: str, config: TreedockConfig, keep: Path, *, reduced: bool = 
         "scene": name,
         **_row(result),
         **_trajectory_error(keep),
-        "frames": frames,
+        "frames": values["frames"],
         "tracked": values["tracked_final"],
-        "render_s": round(rendered_s, 1),
         "process_s": round(values["duration_s"] - values["setup_s"], 1),
         "frame_ms": values["ms"]["frame"]["median"],
         "memory_mb": values["peak_memory_mb"],
     }
+
+
+@contextmanager
+def _rendered(name: str, options: BenchOptions) -> Iterator[Path]:
+    """Give the folder of a scene's sequence: one kept from an earlier call, or rendered now."""
+    from services.simulator.catalogue import scene_by_name
+    from services.simulator.write import write_sequence
+
+    store = options.out / "sequences"
+    kept = store / f"{name}-{'half' if options.quick else 'full'}-{code_version(_SIMULATOR)}"
+    if kept.is_dir():
+        yield kept
+        return
+    store.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f"{name}-", dir=store) as folder:
+        sequence = Path(folder) / name
+        write_sequence(scene_by_name(name), sequence, rate_hz=RATE_HZ, reduced=options.quick)
+        if options.keep_sequences:
+            sequence = sequence.rename(kept)
+        yield sequence
 
 
 def _row(result: Score) -> dict[str, Any]:

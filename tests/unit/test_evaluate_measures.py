@@ -182,3 +182,23 @@ def test_bench_json_ends_with_one_object(
     assert json.loads(printed.out)["bench"] == "catalogue"
     assert "machine" in printed.err
     assert "## catalogue" in (tmp_path / "b.md").read_text()
+
+
+@pytest.mark.parametrize("keep", [True, False])
+def test_rendered_scenes_are_kept_when_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, keep: bool) -> None:
+    from services.simulator import write
+
+    rendered: list[Path] = []
+
+    def fake(_: object, folder: Path, **__: object) -> None:
+        rendered.append(folder)
+        folder.mkdir()
+        (folder / "rgb.txt").write_text("x")
+
+    monkeypatch.setattr(write, "write_sequence", fake)
+    options = BenchOptions(out=tmp_path, keep_sequences=keep)
+    for _ in range(2):
+        with bench_catalogue._rendered("single-01", options) as folder:
+            assert (folder / "rgb.txt").exists()
+    assert len(rendered) == (1 if keep else 2)
+    assert len(list((tmp_path / "sequences").iterdir())) == int(keep)
