@@ -19,9 +19,9 @@ from services.evaluate.synthetic import ChainErrors, SyntheticChain, TrueTrunk
 from services.navigator.autopilot.bridge import Bridge
 from services.navigator.autopilot.config import AutopilotConfig
 from services.navigator.autopilot.link import Codec
-from services.navigator.board import Event, Inputs, Outputs, Seen
 from services.navigator.config import NavigatorConfig
 from services.navigator.mission import Mission
+from services.navigator.values import Event, Inputs, Outputs, Seen
 from services.simulator.px4.config import Px4Config, WindConfig
 from services.simulator.px4.inprocess import InProcessLink
 from services.simulator.px4.simulated import SimulatedPx4

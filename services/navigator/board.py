@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Generic, Literal, TypeVar
 
 import numpy as np
 
-from schemas.navigation import Guidance, GuidanceCommand, MissionState, MissionStateName
-from schemas.slam import Pose
-from schemas.trees import Target, Tree, TreeList
+from schemas.trees import Target, Tree
 from schemas.vehicle import VehicleState
 from services.common.geometry import Matrix, wrap_angle
 from services.navigator.config import NavigatorConfig
@@ -18,87 +14,13 @@ from services.navigator.docking import DockMonitor, DockSample
 from services.navigator.path import Disc
 from services.navigator.selection import axis_at
 from services.navigator.track import Correction, PoseTrack, Sample, Step, TrackLimits
-from services.navigator.trajectory import Aim, Fence, Trajectory
-
-T = TypeVar("T")
+from services.navigator.trajectory import Fence, Trajectory
+from services.navigator.values import Inputs
 
 _AXIS_TIME_CONSTANT_S = 0.4
 _AXIS_GATE_M = 0.6
 _SCAN_BINS = 36
 _LEAST_FENCE_M = 2.0
-
-
-@dataclass(frozen=True, slots=True)
-class Seen(Generic[T]):
-    """A message and when it came, on the aircraft's own clock."""
-
-    message: T
-    received_ns: int
-
-
-@dataclass(frozen=True, slots=True)
-class Inputs:
-    """The latest of everything, at ``now_ns``; ``services`` maps a service to its last health's arrival."""
-
-    now_ns: int
-    pose: Seen[Pose] | None = None
-    trees: Seen[TreeList] | None = None
-    target: Seen[Target] | None = None
-    vehicle: Seen[VehicleState] | None = None
-    services: Mapping[str, int] = field(default_factory=dict)
-
-    def age_s(self, seen: Seen[T] | None) -> float:
-        """Return the seconds since a message came, inf when none did."""
-        return float("inf") if seen is None else (self.now_ns - seen.received_ns) / 1e9
-
-    def service_age_s(self, name: str) -> float:
-        """Return the seconds since a service's last health, inf when it never spoke."""
-        at = self.services.get(name)
-        return float("inf") if at is None else (self.now_ns - at) / 1e9
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    """One transition and its reason."""
-
-    stamp_ns: int
-    before: MissionStateName
-    after: MissionStateName
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class Outputs:
-    """What one step gives."""
-
-    guidance: Guidance
-    state: MissionState
-    events: tuple[Event, ...]
-
-
-Motion = Literal["aim", "brake", "freeze", "follow"]
-"""How the setpoint moves: to the aim; to rest; stop at once; stand where the aircraft is."""
-
-
-@dataclass(frozen=True, slots=True)
-class Intent:
-    """What a state wants done now."""
-
-    command: GuidanceCommand
-    motion: Motion = "brake"
-    aim: Aim | None = None
-    magnitude: float = 0.0
-    unit: Literal["m", "rad", ""] = ""
-    engage: bool = True
-    land: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Next:
-    """The state to go to, and why."""
-
-    state: MissionStateName
-    reason: str
 
 
 @dataclass

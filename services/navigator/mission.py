@@ -13,15 +13,16 @@ from typing import Literal
 import numpy as np
 
 from schemas.command import CommandName
-from schemas.navigation import Guidance, MissionState, MissionStateName, Setpoint
-from services.common.geometry import Matrix, wrap_angle
-from services.navigator.board import Board, Event, Inputs, Intent, Next, Outputs
+from schemas.navigation import MissionStateName
+from services.navigator.board import Board
 from services.navigator.config import NavigatorConfig
 from services.navigator.failsafe import AIRBORNE, Fault, Watch
 from services.navigator.preflight import missing
 from services.navigator.states import STATES
+from services.navigator.telling import Telling
 from services.navigator.track import Step
 from services.navigator.trajectory import Fence
+from services.navigator.values import Event, Inputs, Intent, Next, Outputs
 
 _RESUME: dict[MissionStateName, MissionStateName] = {"approach": "face", "dock": "approach"}
 """Where a hold resumes when not in the state it interrupted: the target is looked for again."""
@@ -162,7 +163,9 @@ class Mission:
         self._move(intent)
         events, self._events = tuple(self._events), []
         self._seq += 1
-        return Outputs(self._guidance(intent, inputs.now_ns), self._report(inputs.now_ns), events)
+        failsafe = self.fault.name if self.fault is not None else ""
+        telling = Telling(self.state, self.previous, self.since_ns, self.reason, self.mission_id, self._seq, failsafe)
+        return Outputs(telling.guidance(self.board, intent), telling.state_message(self.board), events)
 
     def _adopt(self, now_ns: int) -> None:
         """Take over an aircraft that flies under our setpoints when we were started: hold, then land."""
@@ -298,7 +301,6 @@ class Mission:
         if self.state == "scan":
             b.scan_turned_rad += t.yaw_rad - before
 
-    # -- words --------------------------------------------------------------------------------------------------
     def _go(self, to: Next, now_ns: int) -> None:
         if to.state == self.state and to.state != "hold":
             return
@@ -306,38 +308,6 @@ class Mission:
         if to.state != self.state:
             self.previous, self.since_ns = self.state, now_ns
         self.state, self.reason = to.state, to.reason
-
-    def _guidance(self, intent: Intent, now_ns: int) -> Guidance:
-        b, t = self.board, self.board.trajectory
-        last = b.track.latest
-        setpoint = None
-        if last is not None:
-            setpoint = Setpoint(
-                position_m=_vec(t.position_m), yaw_rad=wrap_angle(t.yaw_rad), velocity_m_s=_vec(t.velocity_m_s),
-                yaw_rate_rad_s=float(t.yaw_rate_rad_s),
-            )  # fmt: skip
-        return Guidance(
-            stamp_ns=now_ns, seq=self._seq, map_id=last.map_id if last else "none", command=intent.command,
-            magnitude=float(max(intent.magnitude, 0.0)), unit=intent.unit,
-            engage=intent.engage and not self.config.handheld, land=intent.land, mission_id=self.mission_id,
-            reset_counter=last.reset_counter if last else 0, setpoint=setpoint, reason=self.reason[:500],
-        )  # fmt: skip
-
-    def _report(self, now_ns: int) -> MissionState:
-        b = self.board
-        seen = b.to_axis() if b.target_id is not None else None
-        return MissionState(
-            stamp_ns=now_ns, seq=self._seq, map_id=b.track.latest.map_id if b.track.latest else "none",
-            state=self.state, previous=self.previous, since_ns=self.since_ns, reason=self.reason[:500],
-            target_tree_id=b.target_id, visited_tree_ids=tuple(b.visited_ids), docked_count=b.docked_count,
-            distance_m=None if seen is None else float(seen[0]),
-            heading_error_rad=None if seen is None else float(seen[1]),
-            failsafe=self.fault.name if self.fault is not None else "",
-        )  # fmt: skip
-
-
-def _vec(v: Matrix) -> tuple[float, float, float]:
-    return float(v[0]), float(v[1]), float(v[2])
 
 
 def _yes(reason: str) -> Verdict:

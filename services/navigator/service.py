@@ -23,10 +23,10 @@ from schemas.topics import (
 from schemas.trees import Target, TreeList
 from schemas.vehicle import VehicleState
 from services.common.context import Context
-from services.navigator.board import Inputs, Outputs, Seen
 from services.navigator.commands import CommandDesk
 from services.navigator.config import NavigatorConfig
 from services.navigator.mission import Mission
+from services.navigator.values import Inputs, Outputs, Seen
 
 WATCHED = ("camera", "slam", "mapper", "detector", "refiner", "autopilot", "station")
 """Services whose health the failsafes look at."""

@@ -12,10 +12,11 @@ import numpy as np
 
 from schemas.navigation import MissionStateName
 from services.common.geometry import Matrix, wrap_angle
-from services.navigator.board import Board, Intent, Next
+from services.navigator.board import Board
 from services.navigator.path import clearance_m, plan, standoff
 from services.navigator.selection import choose
 from services.navigator.trajectory import Aim
+from services.navigator.values import Intent, Next
 
 Result = Intent | Next
 

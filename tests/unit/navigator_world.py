@@ -11,9 +11,9 @@ from schemas.slam import Pose, SlamStatus
 from schemas.trees import Target, Tree, TreeList
 from schemas.vehicle import VehicleState
 from services.common.geometry import Matrix, level_camera, rotation_z, to_transform, wrap_angle
-from services.navigator.board import Event, Inputs, Outputs, Seen
 from services.navigator.config import NavigatorConfig
 from services.navigator.mission import Mission
+from services.navigator.values import Event, Inputs, Outputs, Seen
 
 STEP_S = 0.05
 CAMERA_STEPS = 1

@@ -1,0 +1,56 @@
+"""The mission put into messages: guidance for the bridge, state for everybody. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from schemas.navigation import Guidance, MissionState, MissionStateName, Setpoint
+from services.common.geometry import Matrix, wrap_angle
+from services.navigator.board import Board
+from services.navigator.values import Intent
+
+_MAX_REASON = 500
+
+
+@dataclass(frozen=True, slots=True)
+class Telling:
+    """Where the mission stands at one step."""
+
+    state: MissionStateName
+    previous: MissionStateName
+    since_ns: int
+    reason: str
+    mission_id: int
+    seq: int
+    failsafe: str
+
+    def guidance(self, b: Board, intent: Intent) -> Guidance:
+        """Return the command with its magnitude and the setpoint that carries it out."""
+        t, last = b.trajectory, b.track.latest
+        setpoint = None
+        if last is not None:
+            setpoint = Setpoint(
+                position_m=_vec(t.position_m), yaw_rad=wrap_angle(t.yaw_rad), velocity_m_s=_vec(t.velocity_m_s),
+                yaw_rate_rad_s=float(t.yaw_rate_rad_s),
+            )  # fmt: skip
+        return Guidance(
+            stamp_ns=b.now_ns, seq=self.seq, map_id=last.map_id if last else "none", command=intent.command,
+            magnitude=float(max(intent.magnitude, 0.0)), unit=intent.unit,
+            engage=intent.engage and not b.config.handheld, land=intent.land, mission_id=self.mission_id,
+            reset_counter=last.reset_counter if last else 0, setpoint=setpoint, reason=self.reason[:_MAX_REASON],
+        )  # fmt: skip
+
+    def state_message(self, b: Board) -> MissionState:
+        """Return the state with its reason and what is believed of the target."""
+        seen = b.to_axis() if b.target_id is not None else None
+        return MissionState(
+            stamp_ns=b.now_ns, seq=self.seq, map_id=b.track.latest.map_id if b.track.latest else "none",
+            state=self.state, previous=self.previous, since_ns=self.since_ns, reason=self.reason[:_MAX_REASON],
+            target_tree_id=b.target_id, visited_tree_ids=tuple(b.visited_ids), docked_count=b.docked_count,
+            distance_m=None if seen is None else float(seen[0]),
+            heading_error_rad=None if seen is None else float(seen[1]), failsafe=self.failsafe,
+        )  # fmt: skip
+
+
+def _vec(v: Matrix) -> tuple[float, float, float]:
+    return float(v[0]), float(v[1]), float(v[2])
