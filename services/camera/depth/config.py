@@ -1,0 +1,32 @@
+"""Configuration of the depth pipeline; each stage can be switched off."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class DepthConfig(BaseModel):
+    """Stages in their order: range, mixed pixels, bilateral, hole filling, temporal.
+
+    All of them compare inverse depths (1/m): there stereo noise is the same at every range, ``s / (f B)``.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    min_range_m: float = Field(default=0.5, gt=0.0)
+    max_range_m: float = Field(default=6.0, gt=0.0)
+    sigma_inverse: float = Field(default=0.0020, gt=0.0)
+    """Noise of the inverse depth, 1/m: 0.08 px / (565 px * 0.070 m)."""
+    drop_mixed: bool = True
+    bilateral: bool = True
+    bilateral_diameter_px: int = Field(default=5, ge=3, le=11)
+    bilateral_sigma_px: float = Field(default=1.5, gt=0.0)
+    bilateral_sigmas: float = Field(default=5.0, gt=0.0)
+    """Range weight's standard deviation in units of ``sigma_inverse``."""
+    fill_holes: bool = True
+    fill_reach_px: int = Field(default=4, ge=1, le=16)
+    fill_grey_sigma: float = Field(default=12.0, gt=0.0)
+    """How much the grey value may differ on one object."""
+    temporal: bool = False
+    temporal_share: float = Field(default=0.5, gt=0.0, lt=1.0)
+    """Weight of the past; given only to pixels that did not change by more than noise."""
