@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -21,12 +22,13 @@ from services.cli.options import AsJson, ConfigFile, Port, Settings, loaded
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from services.cli.mission import Conductor
     from services.cli.supervisor import Supervisor
     from services.cli.watch import Watch
     from services.common.config import TreedockConfig
     from services.common.stop import StopSignal
 
-_EXIT_INTERRUPTED = 130
+_EXIT_NOT_REACHED = 3
 _ROUTER_WITHIN_S = 20.0
 _LOOK_S = 0.2
 
@@ -54,29 +56,30 @@ def run(
     from rich.console import Console
 
     del no_browser  # the station, which opens one, comes with its own issue
-    _refuse_unknown_autopilot(autopilot)
+    from services.cli.mission import prepared
+
     flags = {"camera.source": source, "simulator.seed": seed, "simulator.scene": scene,
              "navigator.trees_wanted": trees, "navigator.handheld": True if handheld else None}  # fmt: skip
     tree = loaded(config, settings, port, {k: v for k, v in flags.items() if v is not None}).config
-    _check_source(tree)
+    expected = expected_frames(tree)
     tree = with_port(tree, fixed=port is not None)
-    tree = tree.model_copy(update={"clock": "sim" if tree.camera.source == "sim" else "wall"})
-    return Run(tree, Console(stderr=True), logs, as_json=as_json).to_the_end()
+    tree = prepared(tree, autopilot)
+    return Run(tree, Console(stderr=True), logs, expected, as_json=as_json).to_the_end()
 
 
-def _refuse_unknown_autopilot(autopilot: str) -> None:
-    from services.common.errors import InputError
+def expected_frames(tree: TreedockConfig) -> int | None:
+    """Return how many frames the source will give, None when nobody knows.
 
-    if autopilot != "builtin":
-        raise InputError(f"--autopilot {autopilot!r}: this version flies only the scripted path, give builtin")
+    A recording is opened for it, which also finds its faults half a minute before the camera service would.
 
+    Raises:
+        InputError: a recording that cannot be used.
+    """
+    if tree.camera.source in {"sim", "realsense"}:
+        return None
+    from services.camera.sources import open_source
 
-def _check_source(tree: TreedockConfig) -> None:
-    """Open a recording once before anything is started: the camera would find its faults half a minute later."""
-    if tree.camera.source not in {"sim", "realsense"}:
-        from services.camera.sources import open_source
-
-        open_source(tree.camera.source, tree.camera)
+    return open_source(tree.camera.source, tree.camera).expected
 
 
 def with_port(tree: TreedockConfig, *, fixed: bool) -> TreedockConfig:
@@ -97,19 +100,23 @@ def with_port(tree: TreedockConfig, *, fixed: bool) -> TreedockConfig:
 
 
 def services_for(tree: TreedockConfig) -> tuple[str, ...]:
-    """Return the services of a run, in the order in which they start.
+    """Return the services of a run, in the order in which they start."""
+    from services.cli.mission import flies
 
-    The mission's services (navigator, autopilot, station) join here when a run flies.
-    """
-    chain = ("camera", "slam", "mapper", "detector", "refiner")
-    return ("router", *chain, "simulator") if tree.camera.source == "sim" else ("router", *chain)
+    chain = ("router", "camera", "slam", "mapper", "detector", "refiner")
+    if flies(tree):
+        return (*chain, "navigator", "autopilot", "simulator")
+    return (*chain, "simulator") if tree.camera.source == "sim" else chain
 
 
 class Run:
     """One run, from the router's start to the summary."""
 
-    def __init__(self, tree: TreedockConfig, console: Console, logs: Path | None, *, as_json: bool) -> None:
+    def __init__(
+        self, tree: TreedockConfig, console: Console, logs: Path | None, expected: int | None, *, as_json: bool
+    ) -> None:
         self._tree = tree
+        self._expected = expected
         self._console = console
         self._as_json = as_json
         self._keep_logs = logs is not None
@@ -140,7 +147,7 @@ class Run:
             return self._supervised(supervisor, stop)
         except InputError:
             if stop.is_set:  # interrupted before the router was up
-                return _EXIT_INTERRUPTED
+                return _stopped(stop)
             raise
         finally:
             supervisor.stop_all()
@@ -170,12 +177,20 @@ class Run:
             waiting = self._still_waiting(supervisor, stop)
             session = stack.enter_context(opened_client(endpoint, waiting, wait_s=_ROUTER_WITHIN_S))
             watch = Watch(session, self._tree.uav, lambda h: supervisor.heard(h.service, h.pid, h.state))
-            with Status(watch, supervisor, self._console) as status:
+            with Status(watch, supervisor, self._console, self._expected) as status:
                 self._console.print(f"treedock: router on {endpoint}, logs in {self._folder}", highlight=False)
-                self._watch_over(supervisor, watch, status.update, stop)
-            values = self._close(watch, supervisor, time.monotonic() - begin_s)
+                conductor = self._conductor(watch)
+                self._watch_over(supervisor, watch, status.update, stop, conductor)
+            values = self._close(watch, supervisor, time.monotonic() - begin_s, conductor)
             self._print(watch, values)
-        return _EXIT_INTERRUPTED if stop.is_set else 0
+        if stop.is_set:
+            return _stopped(stop)
+        return 0 if conductor is None or values["mission"]["docked"] else _EXIT_NOT_REACHED
+
+    def _conductor(self, watch: Watch) -> Conductor | None:
+        from services.cli.mission import Conductor, flies
+
+        return Conductor(watch, self._tree.supervisor.mission_within_s) if flies(self._tree) else None
 
     def _still_waiting(self, supervisor: Supervisor, stop: StopSignal) -> Callable[[], bool]:
         def given_up() -> bool:
@@ -185,15 +200,22 @@ class Run:
 
         return given_up
 
-    def _watch_over(self, supervisor: Supervisor, watch: Watch, show: Callable[[], None], stop: StopSignal) -> None:
-        """Look after the services until the source has ended and its last frames are worked off, or until the stop."""
+    def _watch_over(
+        self, supervisor: Supervisor, watch: Watch, show: Callable[[], None], stop: StopSignal,
+        conductor: Conductor | None,
+    ) -> None:  # fmt: skip
+        """Look after the services until mission or source has ended and the last frames are worked off, or the stop."""
         ended_s: float | None = None
         while not stop.is_set:
             watch.pump(_LOOK_S)
             supervisor.check()
             self._raise_if_given_up(supervisor)
             show()
-            if watch.source_ended:
+            if conductor is not None:
+                if conductor.update(ready=supervisor.all_ready):
+                    return
+                watch.word = conductor.headline()
+            elif watch.source_ended:
                 ended_s = ended_s or time.monotonic()
                 late = time.monotonic() - ended_s > self._tree.supervisor.drain_within_s
                 if watch.drained or late:
@@ -212,10 +234,14 @@ class Run:
         raise GoalNotReachedError(f"{child.name} {child.last_fault} {child.deaths_in_a_row} times before it was ready: "
                                   f"{last} (all of it in {self._folder / child.name}.log)")  # fmt: skip
 
-    def _close(self, watch: Watch, supervisor: Supervisor, duration_s: float) -> dict[str, Any]:
+    def _close(
+        self, watch: Watch, supervisor: Supervisor, duration_s: float, conductor: Conductor | None
+    ) -> dict[str, Any]:
         from services.cli.summary import figures
 
         values = figures(watch, supervisor, duration_s)
+        if conductor is not None:
+            values["mission"] = conductor.figures()
         if supervisor.restarts and not self._keep_logs:
             values["logs"] = str(self._folder)
         return values
@@ -223,7 +249,7 @@ class Run:
     def _print(self, watch: Watch, values: dict[str, Any]) -> None:
         from rich.console import Console
 
-        from services.cli.summary import closing_line, tree_table
+        from services.cli.summary import closing_line, mission_lines, tree_table
 
         if self._as_json:
             typer.echo(json.dumps(values))
@@ -232,6 +258,13 @@ class Run:
         if values["trees"] or watch.truth is not None:
             console.print(tree_table(watch.trees, watch.truth))
         console.print(f"treedock: {closing_line(values)}", highlight=False, soft_wrap=True)
+        for line in mission_lines(values):
+            console.print(f"treedock: {line}", highlight=False, soft_wrap=True)
+
+
+def _stopped(stop: StopSignal) -> int:
+    """Return the exit code of a run that was stopped, as shells write it: 130 after Ctrl-C, 143 after SIGTERM."""
+    return 128 + int(stop.received or signal.SIGINT)
 
 
 def _last_line(path: Path) -> str:

@@ -43,11 +43,17 @@ def stage(watch: Watch, supervisor: Supervisor) -> str:
     return "waiting for the first frame"
 
 
-def headline(watch: Watch, supervisor: Supervisor) -> str:
-    """Return the run in one line."""
+def headline(watch: Watch, supervisor: Supervisor, expected: int | None = None) -> str:
+    """Return the run in one line; ``expected`` is how many frames will come, if known."""
     trees = watch.trees.trees if watch.trees else ()
     suitable = sum(tree.suitable for tree in trees)
-    parts = [stage(watch, supervisor), f"frame {watch.frames}", f"{len(trees)} trees ({suitable} suitable)"]
+    parts = [
+        stage(watch, supervisor),
+        f"frame {watch.frames}" + (f" of {expected}" if expected else ""),
+        f"{len(trees)} trees ({suitable} suitable)",
+    ]
+    if watch.word:
+        parts.insert(1, watch.word)
     if watch.clock is not None:
         parts.append(f"simulated {watch.clock.stamp_ns * 1e-9:.1f} s")
     if supervisor.restarts:
@@ -74,7 +80,7 @@ def _row(watch: Watch, child: Child) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def table(watch: Watch, supervisor: Supervisor) -> Group:
+def table(watch: Watch, supervisor: Supervisor, expected: int | None = None) -> Group:
     """Return the whole status for a terminal."""
     grid = Table(box=None, pad_edge=False, header_style="dim")
     for column in ("service", "state", "Hz", "ms per stage", "dropped", "restarts", "note"):
@@ -83,7 +89,7 @@ def table(watch: Watch, supervisor: Supervisor) -> Group:
     for child in supervisor.children.values():
         name, state, *rest = _row(watch, child)
         grid.add_row(name, Text(state, style=styles.get(state, "")), *(Text(cell) for cell in rest))
-    return Group(Text(headline(watch, supervisor), style="bold"), grid)
+    return Group(Text(headline(watch, supervisor, expected), style="bold"), grid)
 
 
 @dataclass
@@ -93,6 +99,7 @@ class Status:
     watch: Watch
     supervisor: Supervisor
     console: Console
+    expected: int | None = None
     _live: Live | None = None
     _told_s: float = 0.0
     _told: str = ""
@@ -110,9 +117,9 @@ class Status:
     def update(self) -> None:
         """Show the present state."""
         if self._live is not None:
-            self._live.update(table(self.watch, self.supervisor), refresh=True)
+            self._live.update(table(self.watch, self.supervisor, self.expected), refresh=True)
             return
-        line = headline(self.watch, self.supervisor)
+        line = headline(self.watch, self.supervisor, self.expected)
         if time.monotonic() - self._told_s >= _LINE_PERIOD_S and line != self._told:
             self._told_s, self._told = time.monotonic(), line
             self.console.print(f"treedock: {line}", highlight=False, soft_wrap=True)

@@ -79,7 +79,7 @@ class LiveContext:
     def on(self, topic: Topic, handler: Callable[[M], None], leaf: str | None = None) -> None:
         """Call ``handler(message)`` for each sample."""
         self.topics_in.append(topic)
-        self.bus.subscribe(topic, self._guarded(topic.name, handler), leaf)
+        self.bus.subscribe(topic, self.guarded(topic.name, handler), leaf)
 
     def every(self, period_s: float, handler: Callable[[], None]) -> None:
         """Call ``handler()`` each ``period_s`` of the clock's time; first after one period."""
@@ -123,7 +123,7 @@ class LiveContext:
         """Query a key."""
         return self.bus.ask(topic, request, kind, timeout_s, leaf)
 
-    def _guarded(self, about: str, handler: Callable[[M], None]) -> Callable[[M], None]:
+    def guarded(self, about: str, handler: Callable[[M], None]) -> Callable[[M], None]:
         """Return ``handler`` so that bad data is counted and told; any other exception is a bug and passes."""
 
         def call(message: M) -> None:
@@ -180,7 +180,7 @@ class LiveContext:
         self.bus.subscribe_keys(SIM_CLOCK, moved, at_once=True)
 
 
-class _Overdue:
+class Overdue:
     """Topics that came and then fell silent (a fault), and those not heard yet (told)."""
 
     def __init__(self, context: LiveContext) -> None:
@@ -248,7 +248,7 @@ def run_service(
 
 def _serve(context: LiveContext, build: Build, stop: StopSignal) -> int:
     reporter = HealthReporter(context.service, context.health)
-    overdue: _Overdue | None = None
+    overdue: Overdue | None = None
 
     def report(state: State | None = None) -> None:
         waiting = overdue.update() if overdue else ""
@@ -260,7 +260,7 @@ def _serve(context: LiveContext, build: Build, stop: StopSignal) -> int:
     report("starting")
     context.follow_simulated_clock()
     build(context)
-    overdue = _Overdue(context)
+    overdue = Overdue(context)
     context.every_wall(_HEALTH_PERIOD_NS * 1e-9, report)
     context.bus.declare_live(context.service)
     stop.when_set(context.inbox.wake)

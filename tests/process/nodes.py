@@ -93,17 +93,20 @@ def hanger(context: Context) -> None:
     context.every(0.3, lambda: time.sleep(60.0))
 
 
-def rejecter(_: Context) -> None:
-    raise InputError("camera.json: fx is 'abc', expected a number; mend the file")
+def ticker(context: Context) -> None:
+    """Lives by simulated time."""
+    context.every(1.0, lambda: context.health.count("ticks"))
+    context.every_wall(0.2, lambda: context.health.count("wall_ticks"))
 
 
 ROLES: dict[str, Callable[[Context], None]] = {
     "camera": camera, "slam": slam, "detector": detector, "refuser": refuser, "crasher": crasher, "hanger": hanger,
+    "ticker": ticker,
 }  # fmt: skip
 
 
 def main(role: str, port: int) -> int:
-    config = TreedockConfig(router=RouterConfig(port=port))
+    config = TreedockConfig(router=RouterConfig(port=port), clock="sim" if role == "ticker" else "wall")
     if role == "router":
         return run_router(config)
     return run_service(role, ROLES[role], config)

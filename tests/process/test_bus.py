@@ -9,8 +9,9 @@ import pytest
 import zenoh
 
 from schemas.camera import RgbdFrame
+from schemas.simulation import SimClock
 from schemas.slam import Keyframe, Pose
-from schemas.topics import CAMERA_RGBD, SLAM_KEYFRAME, SLAM_POSE, TREES_LIST
+from schemas.topics import CAMERA_RGBD, SIM_CLOCK, SLAM_KEYFRAME, SLAM_POSE, TREES_LIST
 from schemas.trees import TreeList
 from services.common.bus import Bus
 from services.common.session import shared_memory_note
@@ -196,3 +197,15 @@ def test_a_slow_consumer_gets_the_newest_frame(routed: System) -> None:
 
 def _dropped(bus: Bus) -> int:
     return bus.health.counters["dropped.camera/rgbd"]
+
+
+def test_a_service_lives_by_the_simulators_time_but_tells_its_health_by_the_wall(routed: System) -> None:
+    routed.start("ticker")
+    with routed.bus() as bus:
+        health = HealthWatch(bus)
+        assert until(lambda: health.counter("ticker", "wall_ticks") >= 5, bus=bus)
+        assert health.counter("ticker", "ticks") == 0, "time stands still"
+        for tenth in range(1, 36):
+            bus.publish(SIM_CLOCK, SimClock(stamp_ns=tenth * 100_000_000, seq=tenth, phase="running", frames=0))
+            time.sleep(0.01)
+        assert until(lambda: health.counter("ticker", "ticks") == 3, bus=bus), health.latest
