@@ -10,6 +10,7 @@ from schemas.camera import RgbdFrame
 from schemas.slam import Pose
 from schemas.topics import CAMERA_RGBD, SLAM_POSE, TREES_LIST, TREES_TARGET
 from schemas.trees import Target, Tree, TreeList
+from services.camera.codecs import encode_depth
 from services.common.config import TreedockConfig
 from services.common.context import Context
 from services.common.geometry import Matrix, to_transform
@@ -49,12 +50,12 @@ class Rig:
         self.sender.publish(CAMERA_RGBD, message)
         self.hub.run()
 
-    def pose(self, k: int, T: Matrix | None = None, map_id: str = "m1", *, lost: bool = False) -> None:
+    def pose(self, k: int, T: Matrix | None = None, map_id: str = "m1", *, lost: bool = False, resets: int = 0) -> None:
         message = Pose(
             stamp_ns=k * PERIOD_NS, seq=k, map_id=map_id, status="lost" if lost else "tracking",
             T_map_camera=None if lost else to_transform(camera_at() if T is None else T),
             covariance=None if lost else tuple(float(v) for v in (np.eye(6) * 1e-4)[np.triu_indices(6)]),
-            reset_counter=0, graph_version=1, keyframe_id=0, T_keyframe_camera=None, inliers=100, up_sigma_rad=0.01,
+            reset_counter=resets, graph_version=1, keyframe_id=0, T_keyframe_camera=None, inliers=100, up_sigma_rad=0.01,
             processing_ms=10.0,
         )  # fmt: skip
         self.sender.publish(SLAM_POSE, message)
@@ -179,3 +180,39 @@ def test_lost_and_found(rig: Rig) -> None:
     rig.frame(14)
     rig.pose(14)
     assert rig.targets[-1].measured
+
+
+def test_pose_jump_does_not_throw_the_filters_off(rig: Rig) -> None:
+    rig.trees()
+    for k in range(1, 5):
+        rig.frame(k)
+        rig.pose(k)
+    jumped = camera_at(x=0.08, y=0.05)
+    for k in range(5, 8):
+        rig.frame(k)
+        rig.pose(k, jumped, resets=1)
+    assert [t.measured for t in rig.targets] == [True] * 7
+    # the camera did not move: what is relative to it stays, the place in map jumps with the pose
+    assert rig.targets[-1].range_m == pytest.approx(rig.targets[0].range_m, abs=0.01)
+    assert rig.targets[-1].position_map_m == pytest.approx((2.08, 0.15), abs=0.02)
+
+
+def test_compressed_depth(rig: Rig) -> None:
+    rig.trees()
+    raw = np.round(DEPTH * 1000.0).astype(np.uint16)
+    frame = RgbdFrame(PERIOD_NS, 1, CAMERA, b"", encode_depth(raw, "png"), colour_encoding="none", depth_encoding="png")
+    rig.sender.publish(CAMERA_RGBD, frame)
+    rig.pose(1)
+    assert rig.targets[0].measured
+
+
+def test_two_runs_are_the_same() -> None:
+    runs = []
+    for _ in range(2):
+        rig = Rig()
+        rig.trees()
+        for k in range(1, 5):
+            rig.frame(k)
+            rig.pose(k)
+        runs.append([t.model_dump_json() for t in rig.targets])
+    assert runs[0] == runs[1]

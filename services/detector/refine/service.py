@@ -11,6 +11,7 @@ from schemas.navigation import MissionState
 from schemas.slam import Pose
 from schemas.topics import CAMERA_RGBD, MISSION_STATE, SLAM_POSE, TREES_LIST, TREES_TARGET
 from schemas.trees import Target, Tree, TreeList
+from services.camera.codecs import FrameError, decode_depth
 from services.common.context import Context
 from services.common.geometry import Matrix, from_transform
 from services.detector.refine.config import RefinerConfig
@@ -48,6 +49,7 @@ class RefinerService:
         self._waiting: OrderedDict[int, tuple[int, RgbdFrame]] = OrderedDict()
         self._poses: OrderedDict[int, Pose] = OrderedDict()
         self._last_ns = -1
+        self._reset_counter = 0
         self._trees_map_id, self._pose_map_id = "none", "none"
 
     def on_trees(self, trees: TreeList) -> None:
@@ -108,6 +110,9 @@ class RefinerService:
             self._health.count("frames_without_pose")
             return self._tracker.step(frame.stamp_ns, depth, frame.intrinsics, None, None, fault or "no pose from slam")
         self._pose_map_id = pose.map_id
+        if pose.reset_counter != self._reset_counter:
+            self._reset_counter = pose.reset_counter
+            self._tracker.pose_jumped()
         if pose.map_id != self._trees_map_id:
             return TargetState("none", note=fault or f"no trees of map {pose.map_id} yet")
         T = from_transform(pose.T_map_camera) if pose.T_map_camera is not None else None
@@ -125,11 +130,10 @@ def expected_tree(tree: Tree) -> ExpectedTree:
 def depth_of(frame: RgbdFrame) -> tuple[Depth | None, str]:
     """Return the depth image in metres, or None and what is wrong with it, in one line."""
     i = frame.intrinsics
-    if frame.depth_encoding != "z16":
-        return None, f"frame {frame.seq}: depth comes as {frame.depth_encoding}, expected z16: use camera/rgbd"
-    if len(frame.depth) != 2 * i.width * i.height:
-        return None, f"frame {frame.seq}: {len(frame.depth)} depth bytes, expected {2 * i.width * i.height}"
-    raw = np.frombuffer(frame.depth, np.uint16).reshape(i.height, i.width)
+    try:
+        raw = decode_depth(frame.depth, frame.depth_encoding, i.width, i.height)
+    except FrameError as error:
+        return None, f"frame {frame.seq}: {error}"
     sample = raw[::_SAMPLE_STRIDE, ::_SAMPLE_STRIDE]
     valid = float(np.count_nonzero((sample > 0) & (sample < np.iinfo(np.uint16).max))) / sample.size
     if valid < _MIN_VALID_SHARE:

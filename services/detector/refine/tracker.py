@@ -72,6 +72,11 @@ class RefinerTracker:
         self._map_id, self._chosen, self._pose = map_id, None, None
         self._forget_target()
 
+    def pose_jumped(self) -> None:
+        """Slam corrected the pose by a jump: places in map from before it say nothing about the next image."""
+        self._place_map_m = None
+        self._corrections = {}
+
     def choose(self, tree_id: int | None) -> None:
         """Follow this tree; None: the nearest suitable one in view."""
         self._chosen = tree_id
