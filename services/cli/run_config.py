@@ -23,3 +23,5 @@ class SupervisorConfig(BaseModel):
     """After SIGTERM this long, SIGKILL."""
     drain_within_s: float = Field(default=30.0, ge=0.0)
     """After the source has ended, the longest wait for the services to finish what is under way."""
+    mission_within_s: float = Field(default=1200.0, gt=0.0)
+    """A mission that has not ended by then is broken off."""

@@ -65,8 +65,8 @@ def tree_table(trees: TreeList | None, truth: SimTruth | None) -> Table:
     table = Table(
         title=None if truth is None else f"scene {truth.scene}", header_style="bold", box=SIMPLE_HEAD, pad_edge=False
     )
-    columns = ["tree", "x m", "y m", "radius cm", "confidence", "suitable"]
-    columns += ["true x", "y", "radius", "off cm"] if truth is not None else []
+    columns = ["tree", "x m", "y m", "r cm", "conf", "suitable"]
+    columns += ["true x", "true y", "true r", "off cm"] if truth is not None else []
     for column in columns:
         table.add_column(column, justify="right", no_wrap=True)
     for i, tree in enumerate(found):
@@ -102,3 +102,29 @@ def closing_line(values: dict[str, Any]) -> str:
     restarts = sum(values["restarts"].values())
     dropped = sum(values["dropped"].values())
     return line + (f", {restarts} restarts" if restarts else "") + (f", {dropped} samples dropped" if dropped else "")
+
+
+def mission_lines(values: dict[str, Any]) -> list[str]:
+    """Return the last lines of a flown run: each docking, the believed beside the true, and how it ended."""
+    mission = values.get("mission")
+    if mission is None:
+        return []
+    lines = [_dock_line(dock) for dock in mission["docks"]]
+    if "touches" in mission:
+        lines.append(
+            f"{mission['simulated_s']:.0f} s flown in simulated time, touched {mission['touches']} times, "
+            f"never nearer than {mission['clearance_m']:.2f} m to anything"
+        )
+    word = "docked" if mission["docked"] else "NOT docked"
+    return [*lines, f"{word}; mission {mission['state']}: {mission['reason']}"]
+
+
+def _dock_line(dock: dict[str, Any]) -> str:
+    def pair_of(name: str, form: str) -> str:
+        believed, true = dock.get(name), dock.get(f"true_{name}")
+        text = "unknown" if believed is None else format(believed, form)
+        return text if true is None else f"{text} believed, {format(true, form)} true"
+
+    distance, heading = pair_of("distance_m", ".3f"), pair_of("heading_deg", "+.2f")
+    verdict = "" if dock["good"] else " (outside 0.85..1.00 m or 3 deg, or no suitable tree)"
+    return f"docked at tree {dock['tree_id']}: distance {distance} m; heading error {heading} deg{verdict}"

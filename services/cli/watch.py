@@ -39,6 +39,8 @@ class Watch:
     truth: SimTruth | None = None
     pose: Pose | None = None
     mission: MissionState | None = None
+    word: str = ""
+    """The mission in a few words, where one is flown."""
     _quiet: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

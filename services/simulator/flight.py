@@ -41,6 +41,8 @@ from services.simulator.stage import Stage
 _TURN_S = 0.002
 """Wall time between two steps at least: the bridge has its say in between."""
 _MOST_CREDIT_S = 0.08
+_EYES = ("camera", "slam", "refiner")
+"""Time begins when these live."""
 _SEES = ("slam", "refiner")
 _STEERS = ("autopilot", "navigator")
 _FLOWN_M = 0.5
@@ -118,6 +120,8 @@ class Flight:
             return
         now_s = self._wall()
         self._earn(now_s)
+        if self.phase == "waiting" and not all(map(self._context.alive, _EYES)):
+            return
         if self._rendered is None and self.now_ns >= self._due_ns:
             self._rendered = self._render()
         elif self._rendered is not None:
@@ -181,7 +185,7 @@ class Flight:
 
     def _tell(self) -> None:
         """Say whom time does not wait for."""
-        if self.phase == "done":
+        if self.phase != "running":
             self._publish_clock()
         f, book = self._followers, self._context.health
         book.counters["lockstep_timeouts"] = f.timeouts
