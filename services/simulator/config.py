@@ -55,6 +55,8 @@ class FlightConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    wait_for: tuple[str, ...] = ("camera", "slam", "mapper", "detector", "refiner", "navigator", "autopilot")
+    """Simulated time begins when these services live."""
     lead_s: float = Field(default=0.1, gt=0.0, le=1.0)
     """Simulated time is at most so far ahead of what autopilot and navigator said last."""
     hung_after_s: float = Field(default=2.0, gt=0.0)

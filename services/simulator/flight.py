@@ -41,8 +41,6 @@ from services.simulator.stage import Stage
 _TURN_S = 0.002
 """Wall time between two steps at least: the bridge has its say in between."""
 _MOST_CREDIT_S = 0.08
-_EYES = ("camera", "slam", "refiner")
-"""Time begins when these live."""
 _SEES = ("slam", "refiner")
 _STEERS = ("autopilot", "navigator")
 _FLOWN_M = 0.5
@@ -120,7 +118,7 @@ class Flight:
             return
         now_s = self._wall()
         self._earn(now_s)
-        if self.phase == "waiting" and not all(map(self._context.alive, _EYES)):
+        if self.frames == 0 and self._awaited:
             return
         if self._rendered is None and self.now_ns >= self._due_ns:
             self._rendered = self._render()
@@ -129,6 +127,11 @@ class Flight:
                 self._send(*self._rendered)
         elif self._credit_s > 0.0 and not self._ahead(now_s):
             self._step()
+
+    @property
+    def _awaited(self) -> tuple[str, ...]:
+        """Those who must live before time begins, and do not yet."""
+        return tuple(name for name in self._config.flight.wait_for if not self._context.alive(name))
 
     def _earn(self, now_s: float) -> None:
         """Save up the simulated time that the wall's allows, not much of it."""
@@ -193,5 +196,8 @@ class Flight:
         lost = [name for name in f.missing if name not in f.hung] if self.phase == "running" else []
         missing = f"{' and '.join(lost)} not there" if lost else ""
         words = ", ".join(word for word in (hung, missing) if word)
-        book.note("lockstep", f"{words}: time goes on without" if words else "")
+        if self.frames == 0:
+            book.note("lockstep", f"time begins when {', '.join(self._awaited)} are ready")
+        else:
+            book.note("lockstep", f"{words}: time goes on without" if words else "")
         book.counters["touches"] = self.stage.touches.count
