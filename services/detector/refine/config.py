@@ -54,7 +54,7 @@ class FitConfig(BaseModel):
     iterations: int = Field(default=12, ge=3)
     tukey: float = Field(default=4.0, gt=1.0)
     """Residuals beyond this many sigma have no say."""
-    edge_px: float = Field(default=1.5, gt=0.0)
+    edge_px: float = Field(default=2.0, gt=0.0)
     """Standard deviation of where an object's edge is seen, pixels; common to all rows, so rows do not average it."""
     prior_lean: float = Field(default=0.05, gt=0.0)
     """Standard deviation of the map's axis direction, rad."""

@@ -14,7 +14,6 @@ from services.detector.refine.config import RefinerConfig
 from services.detector.refine.model import Depth, ExpectedTree, Matrix, Measurement, Sight
 from services.detector.refine.view import axis_point, gate_m, pose_offset_covariance, project, sight, window
 
-_NEIGHBOUR_M = 0.5
 _NO_POSE_ERROR = np.zeros((2, 2))
 _MIN_DEPTH_M = 0.1
 
@@ -41,11 +40,12 @@ def refine(
             axis_point(expected, float(view.camera_m[2])) - view.camera_m[:2], pose_covariance
         )
     gate = gate_m(np.eye(2) * expected.sigma_xy_m**2 + shift, config.search)
-    reach = gate + expected.radius_m
+    trees = [(tree, _place(tree, view)) for tree in _near(expected, others, gate)]
+    # a neighbour that could be taken for the target must be looked at itself, or nothing tells the two apart
+    reach = gate + max(tree.radius_m + float(np.hypot(*(place - trees[0][1]))) for tree, place in trees)
     bounds = window(expected, T_map_camera, intrinsics, reach, config.search)
     if bounds is None:
         return None
-    trees = [(tree, _place(tree, view)) for tree in _near(expected, others, gate)]
     found = scan(depth_m, intrinsics, view, expected, reach, trees[0][1], bounds, config)
     fits = candidates(found, trees, gate, config)
     match = associate(fits, trees, shift, gate)
@@ -60,7 +60,7 @@ def refine(
 
 def _near(expected: ExpectedTree, others: Sequence[ExpectedTree], gate: float) -> list[ExpectedTree]:
     """Return the target and those others whose objects may turn up in its window."""
-    reach = 2.0 * gate + _NEIGHBOUR_M
+    reach = 2.0 * gate
     near = [
         tree
         for tree in others
