@@ -53,6 +53,8 @@ class Keyframes(NamedTuple):
     uv: NDArray[np.float32]
     depth: NDArray[np.float32]
     disparity: NDArray[np.float32]
+    info: NDArray[np.float32]
+    """Inverse variance of the disparity."""
     octave: NDArray[np.int32]
     angle: NDArray[np.float32]
     desc: NDArray[np.uint64]
@@ -79,6 +81,7 @@ def _keyframes(k: int, n: int, cells: int) -> Keyframes:
     f32, i32 = np.float32, np.int32
     return Keyframes(
         np.zeros((k, 3, 3)), np.zeros((k, 3)), np.zeros((k, n, 2), f32), np.zeros((k, n), f32), np.zeros((k, n), f32),
+        np.zeros((k, n), f32),
         np.zeros((k, n), i32), np.zeros((k, n), f32), np.zeros((k, n, 4), np.uint64), np.full((k, n), -1, i32),
         np.zeros(k, i32), np.full(k, -1, i32), np.zeros((k, cells + 1), i32), np.zeros((k, n), i32),
     )  # fmt: skip
@@ -137,6 +140,7 @@ class Atlas:
         k, n, kf = int(free[0]), len(features), self.keyframes
         kf.R[k], kf.t[k], kf.n[k], kf.serial[k] = R, t, n, self._serial
         kf.uv[k, :n], kf.depth[k, :n], kf.disparity[k, :n] = features.uv, features.depth, features.disparity
+        kf.info[k, :n] = features.info
         kf.octave[k, :n], kf.angle[k, :n], kf.desc[k, :n] = features.octave, features.angle, features.desc
         kf.cell_start[k], kf.cell_items[k, :n] = features.cell_start, features.cell_items
         kf.point[k] = -1
@@ -149,7 +153,7 @@ class Atlas:
         kf, n = self.keyframes, int(self.keyframes.n[k])
         return Features(
             kf.uv[k, :n].astype(float), kf.octave[k, :n].copy(), kf.angle[k, :n].astype(float), kf.desc[k, :n].copy(),
-            kf.depth[k, :n].astype(float), kf.disparity[k, :n].astype(float), kf.cell_start[k].copy(),
+            kf.depth[k, :n].astype(float), kf.disparity[k, :n].astype(float), kf.info[k, :n].astype(float), kf.cell_start[k].copy(),
             kf.cell_items[k, :n].copy(),
         )  # fmt: skip
 

@@ -289,9 +289,7 @@ def adjust_large(problem: Problem, camera: F64, free: int, iterations: int, robu
 
 
 @njit(cache=True, nogil=True)
-def build(
-    points: Points, kf: Keyframes, ids: I32, slots: I32, index: I32, variance: F64, disparity_info: float
-) -> Problem:
+def build(points: Points, kf: Keyframes, ids: I32, slots: I32, index: I32, variance: F64) -> Problem:
     """Gather points ``ids`` and keyframes ``slots`` (``index`` (K,): place in ``slots``, -1: not in) into a Problem.
 
     ``variance`` (levels,) of u and v by octave, pixels squared.
@@ -317,7 +315,7 @@ def build(
             pose[o] = index[k]
             obs[o, 0], obs[o, 1], obs[o, 2] = kf.uv[k, i, 0], kf.uv[k, i, 1], kf.disparity[k, i]
             info[o, 0] = 1.0 / variance[kf.octave[k, i]]
-            info[o, 1] = disparity_info if obs[o, 2] > 0.0 else 0.0
+            info[o, 1] = kf.info[k, i]
             o += 1
         start[m + 1] = o
     return Problem(R, t, X, start, pose, obs, info, np.ones(total, np.bool_))

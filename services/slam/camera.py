@@ -28,8 +28,6 @@ class CameraModel:
     """(levels,) scale of each octave."""
     variance: F64
     """(levels,) variance of u and v by octave, pixels squared."""
-    disparity_info: float
-    """Inverse variance of the virtual disparity."""
 
 
 def camera_model(intrinsics: Intrinsics, config: SlamConfig) -> CameraModel:
@@ -39,5 +37,4 @@ def camera_model(intrinsics: Intrinsics, config: SlamConfig) -> CameraModel:
     return CameraModel(
         array=np.array([i.fx, i.fy, i.cx, i.cy, i.fx * config.baseline_m]),
         width=float(i.width), height=float(i.height), cols=grid_size(i)[0], scales=scales, variance=scales**2,
-        disparity_info=1.0 / config.disparity_sigma_px**2,
     )  # fmt: skip

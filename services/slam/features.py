@@ -21,6 +21,7 @@ U8 = NDArray[np.uint8]
 
 CELL_PX = 20.0
 """Side of the search grid's cells."""
+_AROUND_PX = 3
 _EDGE_PX = 19
 """No feature nearer to the image's edge: the descriptor's patch would leave it."""
 
@@ -40,6 +41,8 @@ class Features:
     """(N,) metres, 0 = none."""
     disparity: F64
     """(N,) fx * baseline / depth, 0 = none."""
+    info: F64
+    """(N,) inverse variance of the disparity, 0 = none."""
     cell_start: I32
     cell_items: I32
 
@@ -76,19 +79,33 @@ def spread(xy: F64, response: F64, keep: int, width: int, height: int) -> NDArra
 
 
 @njit(cache=True, nogil=True)
-def sample_depth(depth_m: NDArray[np.float32], xy: F64, low_m: float, high_m: float) -> F64:
-    """Return the depth (N,) at pixels: the centre's, or 0 outside of the range or beside a hole or a jump."""
+def sample_depth(
+    depth_m: NDArray[np.float32], xy: F64, low_m: float, high_m: float, bf: float, sigma: float
+) -> tuple[F64, F64]:
+    """Return depth (N,) at pixels, 0 = none, and the inverse variance (N,) of the disparity ``bf / depth``.
+
+    To the sensor's ``sigma`` comes half the range of disparities around the pixel: beside an edge, on a steep surface or
+    where colour and depth were not taken at the same instant nobody knows which of them the feature has.
+    """
     height, width = depth_m.shape
-    out = np.zeros(len(xy))
+    out, info = np.zeros(len(xy)), np.zeros(len(xy))
     for i in range(len(xy)):
         c, r = int(xy[i, 0] + 0.5), int(xy[i, 1] + 0.5)
-        if c < 1 or r < 1 or c >= width - 1 or r >= height - 1:
+        if c < _AROUND_PX or r < _AROUND_PX or c >= width - _AROUND_PX or r >= height - _AROUND_PX:
             continue
         z = depth_m[r, c]
         if z < low_m or z > high_m:
             continue
+        nearest = farthest = z
+        for y in range(r - _AROUND_PX, r + _AROUND_PX + 1):
+            for x in range(c - _AROUND_PX, c + _AROUND_PX + 1):
+                other = depth_m[y, x]
+                if other > 0.0:
+                    nearest, farthest = min(nearest, other), max(farthest, other)
+        half = 0.5 * (bf / nearest - bf / farthest)
         out[i] = z
-    return out
+        info[i] = 1.0 / (sigma * sigma + half * half)
+    return out, info
 
 
 @njit(cache=True, nogil=True)
@@ -125,6 +142,7 @@ class Extractor:
 
         self._intrinsics = intrinsics
         self._config = config
+        self._bf = intrinsics.fx * config.baseline_m
         make_orb: Any = cv2.ORB_create  # type: ignore[attr-defined]  # missing from the stubs
         self._orb: Any = make_orb(
             nfeatures=int(2.0 * config.features), scaleFactor=config.scale, nlevels=config.levels,
@@ -145,9 +163,12 @@ class Extractor:
         pick = spread(table[:, :2], table[:, 2], self._config.features, width, height)
         xy = np.ascontiguousarray(table[pick, :2])
         desc = np.ascontiguousarray(descriptors[pick]).view(np.uint64)
-        depth = sample_depth(depth_m, xy, self._config.min_depth_m, 10.0 * self._config.max_depth_m)
+        depth, info = sample_depth(
+            depth_m, xy, self._config.min_depth_m, 10.0 * self._config.max_depth_m, self._bf,
+            self._config.disparity_sigma_px,
+        )  # fmt: skip
         uv = self.undistort(xy)
-        return self._build(uv, octave[pick], np.deg2rad(table[pick, 3]), desc, depth)
+        return self._build(uv, octave[pick], np.deg2rad(table[pick, 3]), desc, depth, info)
 
     def undistort(self, xy: F64) -> F64:
         """Return undistorted pixels (N, 2)."""
@@ -161,10 +182,9 @@ class Extractor:
 
     def _empty(self) -> Features:
         zero = np.zeros(0)
-        return self._build(np.zeros((0, 2)), np.zeros(0, np.int32), zero, np.zeros((0, 4), np.uint64), np.zeros(0))
+        return self._build(np.zeros((0, 2)), np.zeros(0, np.int32), zero, np.zeros((0, 4), np.uint64), zero, zero)
 
-    def _build(self, uv: F64, octave: I32, angle: F64, desc: NDArray[np.uint64], depth: F64) -> Features:
-        bf = self._intrinsics.fx * self._config.baseline_m
-        disparity = np.where(depth > 0.0, bf / np.where(depth > 0.0, depth, 1.0), 0.0)
+    def _build(self, uv: F64, octave: I32, angle: F64, desc: NDArray[np.uint64], depth: F64, info: F64) -> Features:
+        disparity = np.where(depth > 0.0, self._bf / np.where(depth > 0.0, depth, 1.0), 0.0)
         start, items = grid_of(uv, self._cols, self._rows)
-        return Features(uv, octave, angle, desc, depth, disparity, start, items)
+        return Features(uv, octave, angle, desc, depth, disparity, info, start, items)

@@ -90,7 +90,7 @@ class Mapping:
         """Find points ``ids`` among the features of keyframe ``k``; return how many were joined."""
         atlas, camera = self.atlas, self.camera
         return fuse(
-            atlas.points, atlas.keyframes, k, ids, camera.array, camera.variance, camera.disparity_info, atlas.scales,
+            atlas.points, atlas.keyframes, k, ids, camera.array, camera.variance, atlas.scales,
             camera.cols, camera.width, camera.height,
         )  # fmt: skip
 
@@ -122,7 +122,7 @@ class Mapping:
         slots = np.concatenate([free, fixed]).astype(np.int32)
         index = np.full(len(kf.n), -1, np.int32)
         index[slots] = np.arange(len(slots))
-        problem = build(atlas.points, kf, ids, slots, index, camera.variance, camera.disparity_info)
+        problem = build(atlas.points, kf, ids, slots, index, camera.variance)
         solve = adjust if len(free) <= _COMPILED_KEYFRAMES else adjust_large
         solve(problem, camera.array, len(free), robust_iterations, robust=True)
         gate(chi_squares(problem, camera.array), problem.info, 1.0, problem.use)
@@ -199,7 +199,7 @@ def describe_all(points: Points, kf: Keyframes, k: int, scales: F64) -> None:
 
 @njit(cache=True, nogil=True)
 def fuse(
-    points: Points, kf: Keyframes, k: int, ids: I32, camera: F64, variance: F64, disparity_info: float, scales: F64,
+    points: Points, kf: Keyframes, k: int, ids: I32, camera: F64, variance: F64, scales: F64,
     cols: int, width: float, height: float,
 ) -> int:  # fmt: skip
     """Find points ``ids`` among the features of keyframe ``k``: new observations, or two points made one.
@@ -234,7 +234,7 @@ def fuse(
         e = ((uv[i, 0] - place[c, 0]) ** 2 + (uv[i, 1] - place[c, 1]) ** 2) / variance[kf.octave[k, i]]
         limit = CHI2_MONO
         if disparity[i] > 0.0:
-            e += (disparity[i] - place[c, 2]) ** 2 * disparity_info
+            e += (disparity[i] - place[c, 2]) ** 2 * kf.info[k, i]
             limit = CHI2_DEPTH
         if e > limit:
             continue

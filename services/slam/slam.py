@@ -185,7 +185,7 @@ class Slam:
         k = atlas.slot_of(self._reference)
         ids = atlas.keyframes.point[k]
         ids = ids[ids >= 0]
-        least = 3 if len(atlas.slots) > 2 else 1
+        least = 2 if len(atlas.slots) > 2 else 1
         reference = int(np.count_nonzero(atlas.points.n[ids] >= least))
         return frame.inliers < config.keyframe_ratio * reference
 

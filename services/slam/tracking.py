@@ -111,9 +111,7 @@ class Tracking:
         cam = self.camera
         disparity = features.disparity[index]
         obs = np.column_stack([features.uv[index], disparity])
-        info = np.column_stack(
-            [1.0 / cam.variance[features.octave[index]], np.where(disparity > 0.0, cam.disparity_info, 0.0)]
-        )
+        info = np.column_stack([1.0 / cam.variance[features.octave[index]], features.info[index]])
         use, H = np.ones(len(index), np.bool_), np.zeros((6, 6))
         if len(index) < 6:
             return 0, use, H, 0.0
