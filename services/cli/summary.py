@@ -65,8 +65,8 @@ def tree_table(trees: TreeList | None, truth: SimTruth | None) -> Table:
     table = Table(
         title=None if truth is None else f"scene {truth.scene}", header_style="bold", box=SIMPLE_HEAD, pad_edge=False
     )
-    columns = ["tree", "x m", "y m", "r cm", "conf", "suits"]
-    columns += ["true x", "true y", "true r", "off cm"] if truth is not None else []
+    columns = ["tree", "x m", "y m", "r cm", "conf", "good"]
+    columns += ["true x", "true y", "true r", "off"] if truth is not None else []
     for column in columns:
         table.add_column(column, justify="right", no_wrap=True)
     for i, tree in enumerate(found):
