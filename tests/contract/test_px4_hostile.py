@@ -64,7 +64,7 @@ def sound(c: Companion) -> bool:
     return bool(np.isfinite(v.body.state).all() and np.isfinite(v.estimator.position_m).all())
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.lists(messages(), min_size=1, max_size=12), st.booleans())
 def test_any_message_is_survived(batch: list[Any], flying: bool) -> None:
     c = Companion(quiet())
@@ -79,6 +79,16 @@ def test_any_message_is_survived(batch: list[Any], flying: bool) -> None:
     c.run(0.6)
     assert sound(c)
     assert c.got["HEARTBEAT"]
+
+
+def test_a_position_that_does_not_fit_the_wire_is_dropped_and_counted() -> None:
+    c = Companion(quiet())
+    c.set_origin()
+    c.run(1.0)
+    c.px4.vehicle.origin = (47.0, 8.0, 3e6)
+    c.run(1.0)
+    assert c.px4.counters["unpackable"] > 0
+    assert c.got["HEARTBEAT"][-1][0] > c.now_s - 1.1
 
 
 @settings(max_examples=40, deadline=None)

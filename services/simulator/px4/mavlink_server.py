@@ -6,6 +6,7 @@ Bad input never stops it: unreadable bytes, foreign targets and unknown messages
 from __future__ import annotations
 
 import math
+import struct
 from collections import defaultdict
 
 import numpy as np
@@ -24,6 +25,7 @@ _PARAM_BURST = 5
 _TEXT_BYTES = 50
 _SECOND_ACK_S = 0.02
 _MAX_LATITUDE_DEG = 89.0
+_MAX_ALTITUDE_MM = 50_000_000
 
 
 class Port:
@@ -39,12 +41,18 @@ class Port:
         self.intervals_s = {ident: 1.0 / rate for ident, rate in RATES_HZ.items()}
         self.due_s = dict.fromkeys(self.intervals_s, now_s)
         self.timesync = Timesync()
+        self.unpackable = 0
         self.parameters: list[Parameter] = []
         self.late_acks: list[tuple[float, Message]] = []
 
     def send(self, message: Message) -> None:
-        """Pack with this link's sequence number and send."""
-        self.link.send(message.pack(self.mav))
+        """Pack with this link's sequence number and send; what does not fit its fields (1e9 m away) is dropped."""
+        try:
+            data = message.pack(self.mav)
+        except (struct.error, OverflowError):
+            self.unpackable += 1
+            return
+        self.link.send(data)
         self.mav.seq = (self.mav.seq + 1) % 256
 
     def set_interval(self, ident: int, interval_us: float, now_s: float) -> bool:
@@ -240,7 +248,7 @@ class MavlinkServer:
 
     def _on_origin(self, port: Port, message: Message) -> None:
         latitude, longitude = message.latitude * 1e-7, message.longitude * 1e-7
-        if abs(latitude) > _MAX_LATITUDE_DEG or abs(longitude) > 180.0:
+        if abs(latitude) > _MAX_LATITUDE_DEG or abs(longitude) > 180.0 or abs(message.altitude) > _MAX_ALTITUDE_MM:
             self.counters["origins_refused"] += 1
             return
         self.vehicle.origin = (latitude, longitude, message.altitude * 1e-3)

@@ -97,7 +97,8 @@ class SimulatedPx4:
     @property
     def counters(self) -> dict[str, int]:
         """What was dropped or refused, by kind."""
-        return dict(self._server.counters)
+        unpackable = sum(port.unpackable for port in self._server.ports)
+        return {**self._server.counters, **({"unpackable": unpackable} if unpackable else {})}
 
     # -- the operator and faults ---------------------------------------------------------------------------------
 
