@@ -47,6 +47,8 @@ class Cylinder:
     """Observed over expected noise."""
     points: int
     inside: int
+    fill: float
+    """Density of points near the axis (within 0.6 radius) over that at the surface: 0 for a clean trunk, 1 in a bush."""
     around: int
     """Points within 10 cm outside the surface."""
     arc_rad: float
@@ -167,7 +169,7 @@ def _assess(
     P: Floats, U: Floats, G: Floats, x: Floats, scale: float, k_range: float, surface: float, on: Ints, counts: Floats,
     bands: Ints, z_low: float,
 ) -> None:  # fmt: skip
-    """Fill counts: on, inside, around, arc, noise, mean range. Mark the points on the surface; count them per band."""
+    """Fill counts: on, inside, around, arc, noise, mean range, core, skin. Mark the points on the surface; count them per band."""
     bins = np.zeros(BINS)
     J = np.empty(3)
     counts[:] = 0.0
@@ -180,6 +182,10 @@ def _assess(
         sigma = scale * point_sigma(s, G[i], ray, k_range, surface)
         e = residual(P[i, 0], P[i, 1], U[i, 0], U[i, 1], cx, cy, r, J)
         d = np.sqrt(dx * dx + dy * dy)
+        if d < 0.6 * r:
+            counts[6] += 1
+        elif 0.8 * r < d < 1.2 * r:
+            counts[7] += 1
         on[i] = 0
         if abs(e) < 3.0 * sigma:
             on[i] = 1
@@ -214,18 +220,26 @@ def _axis_frame(voxels: Voxels, near: Ints, at: Floats, R: Floats) -> tuple[Floa
     return np.ascontiguousarray(P), np.ascontiguousarray(U), G
 
 
+def _priors(radius: float) -> Floats:
+    """Return mean and inverse variance of (x, y, slope x, slope y, radius, taper) in the axis frame of a candidate."""
+    slope = 1.0 / (4 * _PRIOR_SLOPE) ** 2
+    return np.array([
+        [0.0, 1e-6], [0.0, 1e-6], [0.0, slope], [0.0, slope], [radius, 1.0 / (0.2 * radius + 0.01) ** 2],
+        [_MEAN_TAPER, 1.0 / _PRIOR_TAPER**2],
+    ])  # fmt: skip
+
+
 def fit_cylinder(voxels: Voxels, stack: Stack, config: DetectorConfig) -> Cylinder | None:
-    """Return the joint fit of a candidate, or None when too few points remain."""
+    """Return the joint fit of a candidate, or None when too few points remain or it leaves its place."""
     at, slope, radius = stack.at_m.copy(), stack.slope.copy(), stack.radius_m
-    far = np.median(voxels.ray_m[:, :2] ** 2) > 0.0
+    prior, normal = _priors(radius), np.zeros((6, 6))
     buffer = np.empty(len(voxels.xyz_m), dtype=np.int64)
-    x = np.zeros(6)
-    R, normal = np.eye(3), np.zeros((6, 6))
+    x = np.array([0.0, 0.0, 0.0, 0.0, radius, _MEAN_TAPER])
     P = U = np.zeros((0, 3))
     G = np.zeros(0)
-    scale = 1.0
+    scale = 1.0 if voxels.seen_from else 3.0  # without views the noise is not known beforehand
     for turn in range(2):
-        reach = radius + max(0.12, 0.4 * radius) + (0.1 if far else 0.0)
+        reach = radius + max(0.12, 0.4 * radius) + (0.1 if voxels.seen_from else 0.0)
         z0, z1 = stack.z_low_m - 0.15, stack.z_high_m + 0.15
         n = int(_near(voxels.xyz_m, at[0], at[1], at[2], slope[0], slope[1], reach, z0, z1, buffer))
         if n < 15:
@@ -233,21 +247,15 @@ def fit_cylinder(voxels: Voxels, stack: Stack, config: DetectorConfig) -> Cylind
         R = rotation_aligning((slope[0], slope[1], 1.0), (0.0, 0.0, 1.0))
         every = 1 + n // _MOST[turn]
         P, U, G = _axis_frame(voxels, buffer[:n:every], at, R)
-        mean_taper = _MEAN_TAPER
-        x[:] = (0.0, 0.0, 0.0, 0.0, radius, mean_taper if turn == 0 else x[5])
-        prior = np.array([
-            [0.0, 1e-6], [0.0, 1e-6], [0.0, 1.0 / (4 * _PRIOR_SLOPE) ** 2], [0.0, 1.0 / (4 * _PRIOR_SLOPE) ** 2],
-            [radius, 1e-6], [mean_taper, 1.0 / _PRIOR_TAPER**2],
-        ])  # fmt: skip
-        scale = float(
-            _fit(P, U, G, every / _CORRELATED, x, config.range_noise_per_m, config.surface_noise_m, 3.0 if turn == 0 else scale, prior, normal)
-        )  # fmt: skip
-        if scale < 0.0:
+        x[:4] = 0.0
+        weight, k_range, surface = every / _CORRELATED, config.range_noise_per_m, config.surface_noise_m
+        scale = float(_fit(P, U, G, weight, x, k_range, surface, scale, prior, normal))
+        if scale < 0.0 or not 0.01 <= x[4] <= 1.5:
             return None
         at = at + R.T @ np.array([x[0], x[1], 0.0])
         axis = R.T @ np.array([x[2], x[3], 1.0])
         slope, radius = axis[:2] / axis[2], float(x[4])
-        if not 0.01 <= radius <= 1.5 or np.hypot(*slope) > 1.5:
+        if np.hypot(*slope) > 1.5:
             return None
     return _measured(P, U, G, x, scale, at, slope, normal, config)
 
@@ -256,7 +264,7 @@ def _measured(
     P: Floats, U: Floats, G: Floats, x: Floats, scale: float, at: Floats, slope: Floats, normal: Floats,
     config: DetectorConfig,
 ) -> Cylinder | None:  # fmt: skip
-    on, counts = np.zeros(len(P), dtype=np.int64), np.zeros(6)
+    on, counts = np.zeros(len(P), dtype=np.int64), np.zeros(8)
     z_low = float(P[:, 2].min())
     bands = np.zeros(int((P[:, 2].max() - z_low) / 0.1) + 1, dtype=np.int64)
     _assess(P, U, G, x, scale, config.range_noise_per_m, config.surface_noise_m, on, counts, bands, z_low)
@@ -268,7 +276,8 @@ def _measured(
     covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     return Cylinder(
         at_m=at, axis=axis, radius_m=float(x[4]), taper=float(x[5]), noise_m=float(counts[4]), scale=scale,
-        points=int(counts[0]), inside=int(counts[1]), around=int(counts[2]), arc_rad=min(float(counts[3]), 2.0 * np.pi),
+        points=int(counts[0]), inside=int(counts[1]), around=int(counts[2]),
+        fill=float(counts[6] / 0.36 / max(counts[7] / 0.8, 1.0)), arc_rad=min(float(counts[3]), 2.0 * np.pi),
         z_low_m=float(at[2] + low * axis[2]), z_high_m=float(at[2] + high * axis[2]),
         cover=len(held) / (held[-1] - held[0] + 1), range_m=float(counts[5]), covariance=covariance,
     )  # fmt: skip

@@ -24,6 +24,8 @@ class Voxels:
     """(M, 3): mean vector from the camera centre to the point, zero where views are unknown."""
     count: Floats
     """(M,) points in the voxel."""
+    seen_from: bool
+    """Whether the rays are known."""
 
 
 @njit(cache=True, nogil=True)
@@ -125,7 +127,7 @@ def crop_to_voxels(
     m = int(
         _voxelise(local, chosen, n, voxel_m, frame.low, index, np.ascontiguousarray(origins), size, xyz, height, ray, count)
     )  # fmt: skip
-    return Voxels(xyz[:m], height[:m], ray[:m], count[:m])
+    return Voxels(xyz[:m], height[:m], ray[:m], count[:m], views is not None)
 
 
 @njit(cache=True, nogil=True)

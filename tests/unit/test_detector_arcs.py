@@ -80,7 +80,7 @@ def _one_slice(noise_m: float, seed: int, rays: bool) -> float:
         xyz.append(np.hstack([p, z]))
         ray.append(np.hstack([p, np.zeros((n, 1))]) if rays else np.zeros((n, 3)))
     points = np.concatenate(xyz)
-    voxels = Voxels(points, points[:, 2], np.concatenate(ray), np.ones(len(points)))
+    voxels = Voxels(points, points[:, 2], np.concatenate(ray), np.ones(len(points)), rays)
     low = np.array([3.0, -1.0, 0.0])
     order, begin = clusters_per_layer(voxels, low, 0.1, 0.05)
     config = DetectorConfig(range_noise_per_m=noise_m / 16.0, surface_noise_m=0.004)

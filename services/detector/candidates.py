@@ -1,0 +1,187 @@
+"""From candidate lines to trunks: fit, check, drop doubles, join forks, put into the words of the result."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from services.detector.checks import axis_at, base_point, prolonged_top_m, shape_fault, space_above_was_seen
+from services.detector.config import DetectorConfig
+from services.detector.cylinders import Cylinder, fit_cylinder
+from services.detector.forks import Fork, find_forks
+from services.detector.model import Floats, Ground, Rejection, Trunk, Views
+from services.detector.stacks import Stack
+from services.detector.upright import Upright
+from services.detector.voxels import Voxels
+
+BREAST_HEIGHT_M = 1.3
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """All that a candidate is judged against."""
+
+    voxels: Voxels
+    above: Voxels
+    views: Views | None
+    frame: Upright
+    ground: Ground
+    span_m: float
+    """Height over which a trunk must be seen."""
+    config: DetectorConfig
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A cylinder that passed the checks; heights above the ground at its base."""
+
+    cylinder: Cylinder
+    base: Floats
+    low_m: float
+    high_m: float
+    top_m: float
+    fork_m: float | None = None
+    """Height of the fork, where it is one tree of two arms."""
+
+
+def judge(stacks: list[Stack], around: Surroundings) -> tuple[list[Trunk], list[Rejection]]:
+    """Return the trunks, sorted by distance from the input's origin in the plan, and what was dropped and why."""
+    kept: list[Candidate] = []
+    rejections: list[Rejection] = []
+    for stack in stacks:
+        found = _examine(stack, kept, around)
+        if isinstance(found, Rejection):
+            rejections.append(found)
+        else:
+            kept.append(found)
+    kept, joined = _join_forks(kept, around)
+    rejections.extend(joined)
+    trunks = [_as_trunk(c, around) for c in kept]
+    trunks.sort(key=lambda t: (np.hypot(t.base_m[0], t.base_m[1]), t.base_m))
+    return trunks, rejections
+
+
+def _examine(stack: Stack, kept: list[Candidate], around: Surroundings) -> Candidate | Rejection:
+    config = around.config
+    cylinder = fit_cylinder(around.voxels, stack, config)
+    if cylinder is None:
+        return _rejection(stack.at_m, stack.radius_m, stack.layers, "too few points for a cylinder", around.frame)
+    base = base_point(cylinder, around.ground)
+    low, high = cylinder.z_low_m - base[2], cylinder.z_high_m - base[2]
+    top = high
+    reason = shape_fault(cylinder, low, high, around.span_m, config) or _twin_fault(cylinder, kept)
+    if not reason:
+        z_top = prolonged_top_m(cylinder, around.above, base[2] + config.look_high_m)
+        top = z_top - base[2]
+        reason = _post_fault(cylinder, top, z_top, around)
+    if reason:
+        return _rejection(base, cylinder.radius_m, stack.layers, reason, around.frame)
+    return Candidate(cylinder, base, low, high, top)
+
+
+def _rejection(at: Floats, radius: float, layers: int, reason: str, frame: Upright) -> Rejection:
+    x, y, z = (float(v) for v in frame.to_input(at))
+    return Rejection(x, y, z, radius, layers, reason)
+
+
+def _post_fault(cylinder: Cylinder, top_m: float, z_top: float, around: Surroundings) -> str:
+    if top_m >= around.config.post_top_m:
+        return ""
+    free = axis_at(cylinder, z_top + 0.35)
+    if not space_above_was_seen(free, around.views, around.frame, around.above, z_top):
+        return ""
+    return f"ends {top_m:.1f} m above ground with free space seen above it: a post"
+
+
+def _twin_fault(cylinder: Cylinder, kept: list[Candidate]) -> str:
+    """Tell when the candidate shares its place with a better one."""
+    for other in kept:
+        z = cylinder.at_m[2]
+        d = float(np.linalg.norm(axis_at(other.cylinder, z)[:2] - cylinder.at_m[:2]))
+        if d < max(other.cylinder.radius_m, cylinder.radius_m) + 0.3 * min(other.cylinder.radius_m, cylinder.radius_m):
+            return "the same trunk as a better candidate"
+    return ""
+
+
+def _join_forks(kept: list[Candidate], around: Surroundings) -> tuple[list[Candidate], list[Rejection]]:
+    """Make one tree of each pair of arms; arms above a stem that is a candidate itself are dropped."""
+    gone: set[int] = set()
+    joined: list[Rejection] = []
+    merged: list[Candidate] = []
+    for fork in find_forks([c.cylinder for c in kept], around.ground):
+        if fork.first in gone or fork.second in gone:
+            continue
+        arms = (fork.first, fork.second)
+        gone.update(arms)
+        stem = next((k for k, c in enumerate(kept) if k not in arms and _stands_below(c, fork)), None)
+        for arm in arms if stem is not None else arms[1:]:
+            c = kept[arm].cylinder
+            reason = f"an arm of a tree that forks {fork.height_m:.1f} m above ground"
+            joined.append(
+                _rejection(kept[arm].base, c.radius_m, round((c.z_high_m - c.z_low_m) / 0.1), reason, around.frame)
+            )
+        if stem is None:
+            merged.append(_forked(kept[fork.first], kept[fork.second], fork, around.ground))
+    return [c for k, c in enumerate(kept) if k not in gone] + merged, joined
+
+
+def _stands_below(candidate: Candidate, fork: Fork) -> bool:
+    at = axis_at(candidate.cylinder, float(fork.at_m[2]))
+    below = candidate.cylinder.z_high_m < fork.at_m[2] + 0.4
+    return below and float(np.linalg.norm(at[:2] - fork.at_m[:2])) < candidate.cylinder.radius_m + 0.05
+
+
+def _forked(a: Candidate, b: Candidate, fork: Fork, ground: Ground) -> Candidate:
+    """Return one tree of two arms: it stands below the fork, upright, as thick as the thicker arm."""
+    thick = a if a.cylinder.radius_m >= b.cylinder.radius_m else b
+    axis = a.cylinder.axis + b.cylinder.axis
+    base = np.array([fork.at_m[0], fork.at_m[1], ground.height_m(float(fork.at_m[0]), float(fork.at_m[1]))])
+    return replace(
+        thick, cylinder=replace(thick.cylinder, axis=axis / np.linalg.norm(axis)), base=base, fork_m=max(fork.height_m, 0.0),
+        low_m=min(a.low_m, b.low_m), high_m=max(a.high_m, b.high_m), top_m=max(a.top_m, b.top_m),
+    )  # fmt: skip
+
+
+def _as_trunk(candidate: Candidate, around: Surroundings) -> Trunk:
+    c, frame = candidate.cylinder, around.frame
+    height = float(np.clip(BREAST_HEIGHT_M, candidate.low_m, candidate.high_m))
+    along = (candidate.base[2] + height - c.at_m[2]) / c.axis[2]
+    radius = max(c.radius_m + c.taper * along, 0.005)
+    lean = float(np.arccos(min(1.0, c.axis[2])))
+    axis = c.axis @ frame.R
+    axis = axis / np.linalg.norm(axis)
+    base = frame.to_input(candidate.base)
+    at_radius = np.array([0.0, 0.0, 0.0, 0.0, 1.0, along])
+    down = candidate.base[2] - c.at_m[2]
+    A = np.array([[1.0, 0.0, down, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, down, 0.0, 0.0]])
+    sigma_xy = float(np.sqrt(max(np.linalg.eigvalsh(A @ c.covariance @ A.T)[-1], 0.0)))
+    remark = _unsuitable(radius, lean, candidate.fork_m, around.config)
+    return Trunk(
+        base_m=(float(base[0]), float(base[1]), float(base[2])), axis=(float(axis[0]), float(axis[1]), float(axis[2])),
+        radius_m=radius, radius_height_m=height, taper=c.taper, height_seen_m=candidate.top_m, low_seen_m=candidate.low_m,
+        sigma_xy_m=sigma_xy, sigma_radius_m=float(np.sqrt(max(at_radius @ c.covariance @ at_radius, 0.0))),
+        arc_rad=c.arc_rad, confidence=_confidence(candidate), layers=round((candidate.high_m - candidate.low_m) / 0.1),
+        points=c.points, noise_m=c.noise_m, lean_rad=lean, suitable=not remark, remark=remark,
+    )  # fmt: skip
+
+
+def _unsuitable(radius: float, lean: float, fork_m: float | None, config: DetectorConfig) -> str:
+    if fork_m is not None and fork_m < config.suitable_fork_m:
+        return f"forks {fork_m:.1f} m above ground"
+    if radius > config.max_suitable_radius_m:
+        return "too thick"
+    if radius < config.min_suitable_radius_m:
+        return "too thin"
+    if lean > config.max_suitable_lean_rad:
+        return f"leans {np.degrees(lean):.0f} deg"
+    return ""
+
+
+def _confidence(candidate: Candidate) -> float:
+    """Return 0..1: how much of the height and of the arc was seen, and how clean the surface is."""
+    c = candidate.cylinder
+    seen = min(1.0, (candidate.high_m - candidate.low_m) / 1.5) * c.cover
+    arc = min(1.0, c.arc_rad / 2.4)
+    clean = c.points / (c.points + 2.0 * c.inside + 0.3 * c.around)
+    return float(np.clip(0.15 + 0.85 * seen * np.sqrt(arc) * clean, 0.0, 1.0))
