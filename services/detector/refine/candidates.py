@@ -120,8 +120,10 @@ def _start(
     """Return a first circle (5,) for an object, or None when it cannot be any of the trees."""
     runs = found.runs[found.label == k]
     near = float(np.median(runs[:, NEAR_M]))
-    tenth = len(runs) // 10
-    if np.sort(runs[:, MAX_M])[-1 - tenth] - np.sort(runs[:, MIN_M])[tenth] > config.search.max_spread_m:
+    # medians and tenths: mixed pixels at the edges stretch single rows
+    tenth, ordered = len(runs) // 10, np.sort(runs[:, NEAR_M])
+    spread = max(ordered[-1 - tenth] - ordered[tenth], float(np.median(runs[:, MAX_M] - runs[:, MIN_M])))
+    if spread > config.search.max_spread_m:
         return None
     middle = 0.5 * (runs[:, LEFT_RAD] + runs[:, RIGHT_RAD])
     half = 0.5 * (runs[:, LEFT_RAD] - runs[:, RIGHT_RAD])
