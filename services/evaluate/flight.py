@@ -201,10 +201,41 @@ def random_case(seed: int, clutter: int = 6, navigator: NavigatorConfig | None =
     trunks: list[TrueTrunk] = []
     while len(trunks) < clutter:
         angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(2.2, 5.5)
-        x, y = float(distance * np.cos(angle)), float(distance * np.sin(angle))
-        if all(np.hypot(x - t.x_m, y - t.y_m) > 1.2 for t in trunks):
-            thick = len(trunks) > 1 and rng.random() < 0.2
-            radius = float(rng.uniform(0.25, 0.4) if thick else rng.uniform(0.05, 0.19))
-            trunks.append(TrueTrunk(x, y, radius, suitable=not thick))
-    wind = WindConfig(mean_m_s=float(rng.uniform(0.0, 1.5)), gust_m_s=float(rng.uniform(0.2, 0.8)))
-    return FlightCase(seed, tuple(trunks), wind=wind, navigator=navigator or NavigatorConfig())
+        thick = len(trunks) > 1 and rng.random() < 0.2
+        radius = float(rng.uniform(0.25, 0.4) if thick else rng.uniform(0.05, 0.19))
+        _plant(trunks, TrueTrunk(*_polar(distance, angle), radius, suitable=not thick))
+    return FlightCase(seed, tuple(trunks), wind=_weather(rng), navigator=navigator or NavigatorConfig())
+
+
+def obstacle_case(seed: int, navigator: NavigatorConfig | None = None) -> FlightCase:
+    """Return a forest whose only suitable tree, 4..5.5 m away, has one to three thick trunks on the way to it."""
+    rng = np.random.default_rng([seed, 78])
+    angle, distance = float(rng.uniform(-np.pi, np.pi)), float(rng.uniform(4.0, 5.5))
+    target = TrueTrunk(*_polar(distance, angle), float(rng.uniform(0.06, 0.19)))
+    trunks = [target]
+    first = angle + float(rng.normal(0.0, 0.04))
+    trunks.append(
+        TrueTrunk(
+            *_polar(distance * float(rng.uniform(0.4, 0.6)), first), float(rng.uniform(0.22, 0.35)), suitable=False
+        )
+    )
+    for _ in range(40):
+        if len(trunks) >= 5:
+            break
+        place = _polar(float(rng.uniform(2.0, 5.5)), angle + float(rng.uniform(-1.2, 1.2)))
+        _plant(trunks, TrueTrunk(*place, float(rng.uniform(0.22, 0.35)), suitable=False))
+    return FlightCase(seed, tuple(trunks), wind=_weather(rng), navigator=navigator or NavigatorConfig())
+
+
+def _polar(distance_m: float, angle_rad: float) -> tuple[float, float]:
+    return float(distance_m * np.cos(angle_rad)), float(distance_m * np.sin(angle_rad))
+
+
+def _plant(trunks: list[TrueTrunk], new: TrueTrunk) -> None:
+    """Add a trunk unless it crowds another."""
+    if all(np.hypot(new.x_m - t.x_m, new.y_m - t.y_m) > 1.2 for t in trunks):
+        trunks.append(new)
+
+
+def _weather(rng: np.random.Generator) -> WindConfig:
+    return WindConfig(mean_m_s=float(rng.uniform(0.0, 1.5)), gust_m_s=float(rng.uniform(0.2, 0.8)))

@@ -179,7 +179,7 @@ class SyntheticChain:
         distance = bearing = 0.0
         if tree_id is not None and tree_id < len(self.trunks):
             distance, bearing, seen = self._in_view(self._trunk_map(tree_id)[:2] - T[:2, 3], camera_yaw(T))
-            seen = seen and self._rng.random() >= e.miss_share
+            seen = seen and self._rng.random() >= e.miss_share and not self._occluded(tree_id, T)
             distance += self._range_bias_m + float(self._rng.normal(0.0, e.range_white_m))
             bearing = wrap_angle(bearing + float(self._rng.normal(0.0, e.bearing_white_rad)))
         heading = camera_yaw(believed) + bearing
@@ -193,6 +193,19 @@ class SyntheticChain:
             raw_range_m=None, raw_radius_m=None,
             position_map_m=(float(place[0]), float(place[1])) if seen else None, covariance_map_m2=None,
         )  # fmt: skip
+
+    def _occluded(self, tree_id: int, T: Matrix) -> bool:
+        """Return whether another trunk hides the middle of this one."""
+        here = T[:2, 3]
+        along = self._trunk_map(tree_id)[:2] - here
+        for i, other in enumerate(self.trunks):
+            if i == tree_id:
+                continue
+            offset = self._trunk_map(i)[:2] - here
+            share = float(np.clip(offset @ along / (along @ along), 0.0, 1.0))
+            if share < 1.0 and float(np.linalg.norm(offset - share * along)) < other.radius_m:
+                return True
+        return False
 
     def _trunk_map(self, i: int) -> Matrix:
         t = self.trunks[i]

@@ -11,8 +11,8 @@ from schemas.vehicle import VehicleState
 from services.common.geometry import Matrix, wrap_angle
 from services.navigator.config import NavigatorConfig
 from services.navigator.docking import DockMonitor, DockSample
-from services.navigator.path import Disc
-from services.navigator.selection import axis_at
+from services.navigator.path import Disc, line_clearance_m
+from services.navigator.selection import SAME_TREE_M, axis_at
 from services.navigator.track import Correction, PoseTrack, Sample, Step, TrackLimits
 from services.navigator.trajectory import Fence, Trajectory
 from services.navigator.values import Inputs
@@ -20,6 +20,7 @@ from services.navigator.values import Inputs
 _AXIS_TIME_CONSTANT_S = 0.4
 _AXIS_GATE_M = 0.6
 _SCAN_BINS = 36
+_HIDING_MARGIN_M = 0.10
 _LEAST_FENCE_M = 2.0
 
 
@@ -63,6 +64,7 @@ class Board:
     target_seen_ns: int | None = None
     """When the target was last tracked in the depth image."""
     _target_stamp_ns: int = -1
+    _list_version: int = -1
     _off_gate: bool = False
     """The depth image shows a trunk where the map has none: not our target, whatever its id."""
 
@@ -109,6 +111,14 @@ class Board:
         t = seen.message
         wrong = t.status != "tracking" or t.tree_id != self.target_id or t.map_id != last.map_id
         return None if wrong or self._off_gate or t.range_m is None or t.bearing_rad is None else t
+
+    @property
+    def hidden(self) -> bool:
+        """Whether another mapped trunk stands between the camera and the target."""
+        here = self.here
+        if here is None or self.axis_m is None:
+            return False
+        return line_clearance_m(here.position_m[:2], self.axis_m, self.discs(_HIDING_MARGIN_M)) < 0.0
 
     @property
     def target_lost(self) -> bool:
@@ -159,11 +169,13 @@ class Board:
             self._drop_map(before, after)
         if self.here is not None and self.step_kind not in (Step.STALE, Step.LOST):
             self._count_scan(self.here)
+        self._follow_list()
         self._follow_target()
 
     def choose(self, tree: Tree) -> None:
         """Make a listed tree the target."""
         self.target_id, self.wanted_id = tree.id, None
+        self._list_version = -1
         self.ground_z_m = tree.z_m
         self.axis_m = self.target_seen_ns = None
         self.axis_m = axis_at(tree, self.flight_z_m)
@@ -234,6 +246,23 @@ class Board:
     def scan_gaps(self) -> int:
         """How many of the 10-degree headings no tracked frame has looked along."""
         return _SCAN_BINS - len(self.scan_seen)
+
+    def _follow_list(self) -> None:
+        """Keep to the target when the list changes: under another id, and, until it is seen, at another place."""
+        seen = self.inputs.trees
+        if seen is None or self.axis_m is None or seen.message.version == self._list_version:
+            return
+        self._list_version = seen.message.version
+        z, axis = self.flight_z_m, self.axis_m
+        named = next((t for t in self.trees if t.id == self.target_id), None)
+        if named is None:
+            near = [(float(np.linalg.norm(axis_at(t, z) - axis)), t.id, t) for t in self.trees if t.suitable]
+            distance, _, named = min(near, default=(float("inf"), 0, None))
+            if named is None or distance > SAME_TREE_M:
+                return
+            self.target_id = named.id
+        if self.target_seen_ns is None:
+            self.axis_m, self.ground_z_m = axis_at(named, z), named.z_m
 
     def _follow_target(self) -> None:
         self._off_gate = False

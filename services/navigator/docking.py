@@ -58,8 +58,8 @@ class DockMonitor:
         while len(self._samples) > 1 and self._samples[1].stamp_ns <= horizon_ns:
             self._samples.popleft()
 
-    def verdict(self) -> DockVerdict:
-        """Judge the window."""
+    def verdict(self, since_s: float = float("inf")) -> DockVerdict:
+        """Judge the window; ``since_s`` is how long docking has lasted: patience ends."""
         if len(self._samples) < _MIN_SAMPLES:
             return DockVerdict(docked=False, reason=f"{len(self._samples)} frames with the target measured")
         t = np.array([s.stamp_ns - self._samples[0].stamp_ns for s in self._samples]) / 1e9
@@ -67,6 +67,8 @@ class DockMonitor:
         bearing = float(np.mean([s.bearing_rad for s in self._samples]))
         positions = np.array([s.position_m for s in self._samples])
         reason = self._fault(t, distance, bearing, positions)
+        if not reason and since_s < self.config.prefer_s and abs(distance - self.config.aim_m) > self.config.prefer_m:
+            reason = "could be nearer to the aim"
         text = f"{distance:.3f} m, {np.degrees(bearing):+.1f} deg"
         return DockVerdict(
             docked=not reason, reason=f"{text}: {reason}" if reason else text, distance_m=distance, bearing_rad=bearing

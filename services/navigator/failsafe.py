@@ -191,7 +191,7 @@ def _target(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
     if doing not in _VISUAL or b.axis_m is None or not b.target_lost:
         return None
     seen = b.to_axis()
-    if doing == "approach" and seen is not None and seen[0] > b.config.visual_range_m:
+    if doing == "approach" and (b.hidden or (seen is not None and seen[0] > b.config.visual_range_m)):
         return None
     return Fault("target lost", "hold", "the target is out of sight", b.config.failsafe.target_hold_s)
 

@@ -97,6 +97,8 @@ def face(b: Board, since_s: float) -> Result:
     if abs(bearing) < _FACING_RAD and still:
         if not b.target_lost:
             return Next("approach", f"tree {b.target_id} in sight, {distance:.2f} m ahead")
+        if b.hidden:
+            return Next("approach", f"tree {b.target_id} is hidden behind a trunk: around it by the map")
         if distance > c.visual_range_m:
             return Next("approach", f"tree {b.target_id} is {distance:.2f} m ahead by the map: nearer to see it")
     if since_s > c.face_wait_s + np.pi / c.turn_rate_rad_s:
@@ -148,7 +150,7 @@ def dock(b: Board, since_s: float) -> Result:
     distance, bearing = seen
     if distance > c.dock.leave_m:
         return Next("approach", f"pushed off to {distance:.2f} m")
-    verdict = b.dock.verdict()
+    verdict = b.dock.verdict(since_s)
     if verdict.docked:
         b.finish_target(visited=True)
         return Next("docked", f"docked at tree {b.target_id}: {verdict.reason}")

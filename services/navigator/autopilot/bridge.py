@@ -26,6 +26,7 @@ from services.navigator.track import Correction, Step
 
 _HEARTBEAT_NS = 1_000_000_000
 _ASK_AGAIN_NS = 2_000_000_000
+_AGREE_NS = 50_000_000
 _AHEAD_S = 0.15
 """A setpoint is carried on along its velocity for at most this long after its guidance was made."""
 _USE_POSITION_VELOCITY_YAW_RATE = 448
@@ -43,13 +44,14 @@ class Bridge:
         self.engagement = Engagement(config)
         self.parameters = ParameterReader(config.vehicle)
         self.setpoints_sent = 0
+        self._wrong = refusals({}, config.vehicle)
         self._corrections: dict[tuple[str, int], Correction] = {}
         """From the map as it was under (map_id, reset_counter) to the present one."""
         self._moved_ns = -1
         """Guidance made before this is in a map that cannot be related to the present one."""
         self._held: tuple[Matrix, float] | None = None
         self._sent: tuple[Matrix, float] | None = None
-        self._due = {"heartbeat": 0, "setpoint": 0, "ask": 0}
+        self._due = {"heartbeat": 0, "setpoint": 0, "ask": 0, "agree": 0}
         self._seq = 0
 
     # -- in -----------------------------------------------------------------------------------------------------
@@ -75,6 +77,7 @@ class Bridge:
         """Take a message of the autopilot. What others say on the link is not heard."""
         if self.telemetry.take(message, received_ns) and message.get_type() == "PARAM_VALUE":
             self.parameters.take(message.param_id, message.param_value, message.param_type)
+            self._wrong = refusals(self.parameters.found, self.config.vehicle)
 
     # -- out ----------------------------------------------------------------------------------------------------
     def tick(self, now_ns: int) -> list[Any]:
@@ -92,7 +95,8 @@ class Bridge:
         odometry = self.vision.message(now_ns)
         if odometry is not None:
             out.append(odometry)
-        self.telemetry.agree(self.vision.body(now_ns), now_ns)
+        if self._is_due("agree", now_ns, _AGREE_NS):
+            self.telemetry.agree(self.vision.body(now_ns), now_ns)
         orders = self.engagement.update(self.vehicle(now_ns), now_ns)
         if self.engagement.streams:
             if self._is_due("setpoint", now_ns, round(1e9 / self.config.setpoint_hz)):
@@ -114,8 +118,7 @@ class Bridge:
             return ""
         if not self.parameters.complete:
             return "parameters are still being read"
-        wrong = refusals(self.parameters.found, self.config.vehicle)
-        return f"parameters: {'; '.join(wrong)}" if wrong else ""
+        return f"parameters: {'; '.join(self._wrong)}" if self._wrong else ""
 
     def state(self, now_ns: int) -> VehicleState:
         """Return the vehicle state for the bus."""
