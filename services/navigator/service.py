@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable
 from typing import get_args
@@ -27,6 +28,8 @@ from services.navigator.commands import CommandDesk
 from services.navigator.config import NavigatorConfig
 from services.navigator.mission import Mission
 from services.navigator.values import Inputs, Outputs, Seen
+
+LOG = logging.getLogger(__name__)
 
 WATCHED = ("camera", "slam", "mapper", "detector", "refiner", "autopilot", "station")
 """Services whose health the failsafes look at."""
@@ -75,6 +78,8 @@ class Navigator:
         self._steps += 1
         if outputs.events or self._steps % _STATE_EVERY == 0:
             c.publish(MISSION_STATE, outputs.state)
+        for event in outputs.events:
+            LOG.info("%s -> %s: %s", event.before, event.after, event.reason)
         c.health.count("steps")
         c.health.count("transitions", len(outputs.events))
         word = outputs.state.failsafe
@@ -111,8 +116,10 @@ class Navigator:
             reason = f"sent to cmd/{name} but named {command.name}"
         if reason:
             self._context.health.count("commands_refused")
+            LOG.info("command %s of %s refused: %s", name, command.sender, reason)
             return CommandReply(accepted=False, reason=reason, state=self.mission.state)
         verdict = self.mission.order(command.name, command.tree_id, now_ns)
+        LOG.info("command %s of %s: %s", name, command.sender, verdict.reason)
         self._context.health.count("commands_accepted" if verdict.accepted else "commands_refused")
         return CommandReply(accepted=verdict.accepted, reason=verdict.reason[:500], state=self.mission.state)
 

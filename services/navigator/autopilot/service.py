@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import logging
 
 from schemas.navigation import Guidance
 from schemas.slam import Pose
@@ -11,6 +12,8 @@ from services.common.context import Context
 from services.navigator.autopilot.bridge import Bridge
 from services.navigator.autopilot.config import AutopilotConfig
 from services.navigator.autopilot.link import Codec, Link, MavlinkLink, open_wire
+
+LOG = logging.getLogger(__name__)
 
 
 class Autopilot:
@@ -21,6 +24,7 @@ class Autopilot:
         self._link = link
         self.bridge = Bridge(config)
         self._identified = False
+        self._note = ""
 
     def register(self) -> None:
         """Connect to the bus."""
@@ -54,6 +58,9 @@ class Autopilot:
         now_ns = self._context.clock.now_ns()
         state = self.bridge.state(now_ns)
         self._context.publish(VEHICLE_STATE, state)
+        if state.note != self._note:
+            self._note = state.note
+            LOG.info("%s (mode %s, %s)", state.note, state.mode, "armed" if state.armed else "disarmed")
         book = self._context.health
         book.counters["odometry_sent"] = self.bridge.vision.sent
         book.counters["setpoints_sent"] = self.bridge.setpoints_sent
