@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -90,7 +91,8 @@ def _rendered(name: str, options: BenchOptions) -> Iterator[Path]:
     store.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=f"{name}-", dir=store) as folder:
         sequence = Path(folder) / name
-        write_sequence(scene_by_name(name), sequence, rate_hz=RATE_HZ, reduced=options.quick)
+        noise_seed = zlib.crc32(name.encode())  # each scene its own: one accelerometer bias for all would prove little
+        write_sequence(scene_by_name(name), sequence, rate_hz=RATE_HZ, reduced=options.quick, seed=noise_seed)
         if options.keep_sequences:
             sequence = sequence.rename(kept)
         yield sequence
