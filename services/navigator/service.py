@@ -48,7 +48,7 @@ class Navigator:
         self._target: Seen[Target] | None = None
         self._vehicle: Seen[VehicleState] | None = None
         self._services: dict[str, int] = {}
-        self._steps = 0
+        self._steps = self._states = 0
 
     def register(self, rate_hz: float) -> None:
         """Connect to the bus."""
@@ -77,7 +77,9 @@ class Navigator:
         c.publish(MISSION_GUIDANCE, outputs.guidance)
         self._steps += 1
         if outputs.events or self._steps % _STATE_EVERY == 0:
-            c.publish(MISSION_STATE, outputs.state)
+            # numbered as sent: gaps would count as lost messages at the receivers
+            c.publish(MISSION_STATE, outputs.state.model_copy(update={"seq": self._states}))
+            self._states += 1
         for event in outputs.events:
             LOG.info("%s -> %s: %s", event.before, event.after, event.reason)
         c.health.count("steps")
