@@ -64,7 +64,7 @@ class SlamService:
             health.note("camera/rgbd", f"{error}; the frame was dropped")
             return
         health.note("camera/rgbd", "")
-        slam = self._slam_for(frame.intrinsics)
+        slam = self._slam_for(frame)
         with health.timed("track"):
             depth_m = depth_raw.astype(np.float32) / np.float32(frame.intrinsics.depth_scale)
             accel = None if frame.accel_camera is None else np.array(frame.accel_camera)
@@ -99,10 +99,11 @@ class SlamService:
         grey = cv2.cvtColor(decode_colour(frame), cv2.COLOR_BGR2GRAY)
         return grey.astype(np.uint8, copy=False), decode_depth_raw(frame)
 
-    def _slam_for(self, intrinsics: Intrinsics) -> Slam:
+    def _slam_for(self, frame: RgbdFrame) -> Slam:
         if self.slam is None:
-            self._intrinsics = intrinsics
-            self.slam = Slam(intrinsics, self._config)
+            self._intrinsics = frame.intrinsics
+            # named by its first frame: a slam that was restarted never passes its new map off as the old one
+            self.slam = Slam(frame.intrinsics, self._config, map_id=f"map-{frame.stamp_ns}")
         return self.slam
 
     def _attitude(self, stamp_ns: int) -> Matrix | None:
