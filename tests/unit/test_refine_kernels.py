@@ -73,7 +73,9 @@ def test_fit_is_unbiased_under_noise_along_the_ray(radius: float) -> None:
         p, H, stats = np.empty(5), np.empty((5, 5)), np.empty(3)
         start = truth + np.array([0.05, -0.03, 0.03, 0.0, 0.0])
         prior_sigma = np.array([1.0, 1.0, 0.1, 0.05, 0.05])
-        assert kf.fit_trunk(points, 1200, np.empty((0, 4)), 0, start, start, prior_sigma, 0.001, 4.0, 12, p, H, stats)
+        assert kf.fit_trunk(
+            points, 1200, np.empty((0, 4)), 0, start, start, prior_sigma, 0.001, 4.0, 12, 4, p, H, stats
+        )
         errors.append(p[:3] - truth[:3])
     mean = np.mean(errors, axis=0)
     assert abs(mean[2]) < 0.003

@@ -119,17 +119,17 @@ def _start(
 ) -> Matrix | None:
     """Return a first circle (5,) for an object, or None when it cannot be any of the trees."""
     runs = found.runs[found.label == k]
-    near = float(np.median(runs[:, NEAR_M]))
+    near = _median(runs[:, NEAR_M])
     # medians and tenths: mixed pixels at the edges stretch single rows
     tenth, ordered = len(runs) // 10, np.sort(runs[:, NEAR_M])
-    spread = max(ordered[-1 - tenth] - ordered[tenth], float(np.median(runs[:, MAX_M] - runs[:, MIN_M])))
+    spread = max(ordered[-1 - tenth] - ordered[tenth], _median(runs[:, MAX_M] - runs[:, MIN_M]))
     if spread > config.search.max_spread_m:
         return None
     middle = 0.5 * (runs[:, LEFT_RAD] + runs[:, RIGHT_RAD])
     half = 0.5 * (runs[:, LEFT_RAD] - runs[:, RIGHT_RAD])
     whole = _free(runs[:, LEFT_KIND]) & _free(runs[:, RIGHT_KIND])
     use = whole if int(np.sum(whole)) * 3 >= len(runs) else np.ones(len(runs), dtype=bool)
-    bearing, sine = float(np.median(middle[use])), float(np.sin(np.clip(np.median(half[use]), 0.0, 1.2)))
+    bearing, sine = _median(middle[use]), float(np.sin(np.clip(_median(half[use]), 0.0, 1.2)))
     seen_radius = near * sine / max(1.0 - sine, 0.1)
     best: Matrix | None = None
     best_distance = reach_m
@@ -145,6 +145,11 @@ def _start(
             best_distance = distance
             best = np.array([centre[0], centre[1], radius, 0.0, 0.0])
     return best
+
+
+def _median(values: Matrix) -> float:
+    """Return the upper median; np.median takes ten times as long on so few numbers."""
+    return float(np.sort(values)[len(values) // 2])
 
 
 def _free(kind: Matrix) -> NDArray[np.bool_]:
@@ -171,7 +176,7 @@ def fit_object(
     p, H, stats = np.empty(5), np.empty((5, 5)), np.empty(3)
     good = kernels_fit.fit_trunk(
         points, n, edges, m, start, prior, sigma, fit.edge_px / found.focal_px, fit.tukey,
-        _QUICK_ITERATIONS if quick else fit.iterations, p, H, stats,
+        _QUICK_ITERATIONS if quick else fit.iterations, 4 if quick else 2, p, H, stats,
     )  # fmt: skip
     if not good or stats[0] < 3:
         return None
@@ -191,6 +196,6 @@ def join_alike(found: Scan, fit: Fit, fits: list[Fit]) -> None:
 def extent(found: Scan, k: int) -> tuple[tuple[float, float], tuple[int, int], float]:
     """Return (left and right column, first and last row, angle seen from the camera) of an object."""
     runs = found.runs[found.label == k]
-    columns = (float(np.median(runs[:, FIRST])), float(np.median(runs[:, LAST])))
-    angle = float(np.median(runs[:, LEFT_RAD] - runs[:, RIGHT_RAD]))
+    columns = (_median(runs[:, FIRST]), _median(runs[:, LAST]))
+    angle = _median(runs[:, LEFT_RAD] - runs[:, RIGHT_RAD])
     return columns, (int(runs[0, ROW]), int(runs[-1, ROW])), angle

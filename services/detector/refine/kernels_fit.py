@@ -219,11 +219,11 @@ def solve(H: Matrix, g: Matrix, x: Matrix) -> bool:
 @njit(cache=True, nogil=True)
 def fit_trunk(
     points: Matrix, n: int, edges: Matrix, n_edges: int, start: Matrix, prior: Matrix, prior_sigma: Matrix,
-    lateral: float, tukey: float, iterations: int, p: Matrix, H: Matrix, stats: Matrix,
+    lateral: float, tukey: float, iterations: int, narrowing: int, p: Matrix, H: Matrix, stats: Matrix,
 ) -> bool:  # fmt: skip
     """Robust damped Gauss-Newton from ``start`` (5,) with a weak prior (5,); fills p, the information H and stats.
 
-    The Tukey scale shrinks over the first iterations, so that a start that is centimetres off still sees its points.
+    The Tukey scale shrinks over the first ``narrowing`` iterations, so that a start that is centimetres off still sees its points.
     ``stats`` (3,): inliers, their summed squared residuals in sigmas, points.
     """
     g, step = np.empty(PARAMETERS), np.empty(PARAMETERS)
@@ -232,7 +232,7 @@ def fit_trunk(
         H[:] = 0.0
         g[:] = 0.0
         stats[:] = 0.0
-        scale = 1.0 + 3.0 * max(0.0, 1.0 - iteration / 4.0)
+        scale = 1.0 + 3.0 * max(0.0, 1.0 - iteration / narrowing)
         _add_points(points, n, p, lateral, tukey, scale, H, g, stats)
         _add_edges(edges, n_edges, p, lateral * math.sqrt(p[0] ** 2 + p[1] ** 2), tukey * scale, H, g)
         for i in range(PARAMETERS):
@@ -249,7 +249,7 @@ def fit_trunk(
         for i in range(PARAMETERS):
             p[i] -= factor * step[i]
         p[2] = max(p[2], 0.005)
-        if largest < 1e-4 and iteration >= 5:
+        if largest < 1e-4 and iteration > narrowing:
             break
     for i in range(PARAMETERS):
         for j in range(i):
