@@ -109,9 +109,9 @@ TREES_TARGET = Topic("trees/target", Target, "refiner", ("navigator", "simulator
                      "interactive_high", express=True, description="the target trunk in the depth image")  # fmt: skip
 MISSION_STATE = Topic("mission/state", MissionState, "navigator", ("refiner", "autopilot", "station"), 5, 1.0, _R, _STREAM,
                       "interactive_high", express=True, description="the mission's state, its reason, the target")  # fmt: skip
-MISSION_GUIDANCE = Topic("mission/guidance", Guidance, "navigator", ("autopilot",), 20, 0.3, _A, _STREAM,
+MISSION_GUIDANCE = Topic("mission/guidance", Guidance, "navigator", ("autopilot", "simulator"), 20, 0.3, _A, _STREAM,
                          "interactive_high", express=True, description="one of eight commands with its setpoint")  # fmt: skip
-VEHICLE_STATE = Topic("vehicle/state", VehicleState, "autopilot", ("navigator", "slam", "station"), 20, 0.5, _R, _STREAM,
+VEHICLE_STATE = Topic("vehicle/state", VehicleState, "autopilot", ("navigator", "slam", "simulator", "station"), 20, 0.5, _R, _STREAM,
                       "interactive_high", express=True, description="mode, arming, attitude, battery")  # fmt: skip
 COMMAND = Topic("cmd/*", Command, "station", ("navigator",), 0, None, _R, _QUERY, "real_time", express=True,
                 description="start hold resume abort land choose next: the reply says accepted or why not")  # fmt: skip

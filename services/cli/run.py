@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from services.common.stop import StopSignal
 
 _EXIT_NOT_REACHED = 3
-_ROUTER_WITHIN_S = 20.0
+_ROUTER_WITHIN_S = 60.0
 _LOOK_S = 0.2
 
 
