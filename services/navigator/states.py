@@ -25,7 +25,10 @@ _STILL_M_S = 0.15
 _FACING_RAD = float(np.radians(5.0))
 _TURN_FIRST_RAD = float(np.radians(8.0))
 """Guidance says turn rather than toward beyond this heading error."""
+_CENTRED_RAD = float(np.radians(2.0))
 _CORNER_M = 0.25
+_GAP_M = 0.025
+"""Guidance says stop within this distance of the aim."""
 _REPLAN_S = 1.0
 _YAW_LEAD_NS = 300_000_000
 """The aircraft's yaw follows its setpoint by about this much later."""
@@ -150,7 +153,7 @@ def dock(b: Board, since_s: float) -> Result:
     distance, bearing = seen
     if distance > c.dock.leave_m:
         return Next("approach", f"pushed off to {distance:.2f} m")
-    verdict = b.dock.verdict(since_s)
+    verdict = b.dock.verdict(float("inf") if c.handheld else since_s)
     if verdict.docked:
         b.finish_target(visited=True)
         return Next("docked", f"docked at tree {b.target_id}: {verdict.reason}")
@@ -158,11 +161,10 @@ def dock(b: Board, since_s: float) -> Result:
         name = b.target_id
         b.finish_target(visited=False)
         return Next("undock", f"could not settle at tree {name}: {verdict.reason}")
-    aim = _station(b, distance, bearing)
-    if abs(bearing) > _TURN_FIRST_RAD:
+    aim, gap = _station(b, distance, bearing), distance - c.dock.aim_m
+    if abs(bearing) > (_CENTRED_RAD if abs(gap) < _GAP_M else _TURN_FIRST_RAD):
         return Intent("turn_left" if bearing > 0.0 else "turn_right", "aim", aim, abs(bearing), "rad")
-    gap = distance - c.dock.aim_m
-    if abs(gap) < 0.05:
+    if abs(gap) < _GAP_M:
         return Intent("stop", "aim", aim)
     return Intent("toward" if gap > 0.0 else "backward", "aim", aim, abs(gap), "m")
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.evaluate.flight import Flight, random_case
+from services.evaluate.flight import Flight, obstacle_case, random_case
 from services.navigator.autopilot.bridge import Bridge
+from services.navigator.config import NavigatorConfig
 from services.navigator.mission import Mission
 from services.simulator.px4.modes import NavState
 
@@ -103,3 +104,19 @@ def test_bridge_killed_px4_lands_and_a_new_bridge_stays_silent() -> None:
     assert flight.state in ("released", "landed")
     _ticks(flight, 10.0)
     assert not flight.px4.armed
+
+
+def test_around_a_trunk_on_the_way() -> None:
+    flight = Flight(obstacle_case(3))
+    flight.start()
+    assert flight.run(("docked",)) == "docked", flight.mission.reason
+    assert flight.touches == 0
+    assert flight.clearance_m > flight.case.navigator.aircraft_radius_m + 0.1
+
+
+def test_three_trees_then_home() -> None:
+    flight = Flight(random_case(2, navigator=NavigatorConfig(trees_wanted=3)))
+    flight.start()
+    assert flight.run() == "landed", flight.mission.reason
+    assert len(flight.dock_errors) == 3
+    assert np.linalg.norm(flight.px4.true_pose()[:2, 3]) < 0.7

@@ -55,6 +55,8 @@ class World:
     dead: set[str] = field(default_factory=set)
     battery: float | None = 0.9
     station: bool = False
+    revision: int = 0
+    """Of the list of trees: raise it after changing them."""
     events: list[Event] = field(default_factory=list)
     outputs: Outputs | None = None
     armings: int = 0
@@ -114,7 +116,7 @@ class World:
             self._pose = Seen(self._pose_message(self.slam), self.now_ns)
         if self.refiner_alive:
             self._target = Seen(self._target_message(), self.now_ns)
-        listed = self.mission.board.docked_count + self.reset_counter
+        listed = self.revision + self.reset_counter
         if self._trees is None or self._trees.message.version != listed or self._trees.message.map_id != self.map_id:
             self._trees = Seen(self._list(listed), self.now_ns)
         if not self.vehicle_silent:

@@ -251,7 +251,7 @@ def test_a_trunk_in_the_way_brakes() -> None:
     assert np.linalg.norm(velocity) > 0.05
     ahead = here + velocity / np.linalg.norm(velocity) * 0.75
     world.trees.append(tree(9, float(ahead[0]), float(ahead[1])))
-    world.mission.board.docked_count += 100  # a new list
+    world.revision += 1
     world.run("hold", 2.0)
     assert world.state == "hold"
     assert "trunk stands in the way" in world.mission.reason

@@ -35,3 +35,87 @@ def test_three_trees_then_home() -> None:
     assert _course(world).count("docked") == 3
     assert "return" in _course(world)
     assert np.linalg.norm(world.position_m[:2]) < 0.5
+
+
+def test_the_target_keeps_its_trunk_when_the_list_numbers_anew() -> None:
+    world = World()
+    world.start()
+    world.run("approach")
+    before = world.mission.board.target_id
+    assert before is not None
+    world.trees = [t.model_copy(update={"id": t.id + 10}) for t in world.trees]
+    world.revision += 1
+    assert world.run("docked") == "docked", world.mission.reason
+    assert world.mission.board.visited_ids == [before + 10]
+    assert "hold" not in _course(world)
+
+
+def test_a_trunk_in_front_is_flown_around_and_hides_nothing_forever() -> None:
+    world = World(trees=[tree(1, 4.5, 0.0), tree(2, 2.2, 0.05, 0.3, suitable=False)])
+    world.start()
+    clearance = []
+    while world.state not in ("docked", "landed", "failed", "released"):
+        world.step()
+        clearance.append(float(np.linalg.norm(world.position_m[:2] - [2.2, 0.05])) - 0.3)
+    assert world.state == "docked", world.mission.reason
+    assert min(clearance) > world.config.aircraft_radius_m + 0.2
+    assert "hold" not in _course(world)
+
+
+def test_a_tree_that_cannot_be_reached_is_given_up() -> None:
+    ring = [
+        tree(10 + i, 4.0 + 1.1 * np.cos(a), 1.1 * np.sin(a), 0.25, suitable=False)
+        for i, a in enumerate(np.linspace(0, 5.6, 9))
+    ]
+    world = World(trees=[tree(1, 4.0, 0.0), *ring, tree(2, -3.5, 0.0)])
+    world.mission.board.trees_wanted = 1
+    world.start()
+    world.run("docked", 300.0)
+    assert world.state == "docked", world.mission.reason
+    assert world.mission.board.visited_ids == [2]
+
+
+def test_no_tree_at_all_comes_down_and_says_so() -> None:
+    world = World(trees=[tree(4, 3.0, 0.0, 0.35, suitable=False)])
+    world.start()
+    assert world.run("landed", 120.0) == "landed"
+    assert any("no suitable tree" in e.reason for e in world.events)
+    assert world.mission.board.docked_count == 0
+
+
+def test_the_same_inputs_give_the_same_bytes() -> None:
+    def flown() -> list[str]:
+        world = World()
+        world.start()
+        out = []
+        for _ in range(600):
+            assert world.step()
+            assert world.outputs is not None
+            out.append(world.outputs.guidance.model_dump_json() + world.outputs.state.model_dump_json())
+        return out
+
+    assert flown() == flown()
+
+
+def test_handheld_guides_a_person_without_a_vehicle() -> None:
+    world = World(NavigatorConfig(handheld=True))
+    world.vehicle_silent = True
+    world.position_m = np.array([0.0, 0.0, 1.4])
+    world.start()
+    commands = set()
+    for _ in range(round(120.0 / 0.05)):
+        out = world.step()
+        g = out.guidance
+        commands.add(g.command)
+        assert not g.engage
+        if g.command in ("turn_left", "turn_right"):
+            world.yaw_rad += (1 if g.command == "turn_left" else -1) * min(0.5 * 0.05, g.magnitude)
+        elif g.command in ("toward", "backward"):
+            forward = np.array([np.cos(world.yaw_rad), np.sin(world.yaw_rad), 0.0])
+            world.position_m = world.position_m + (1 if g.command == "toward" else -1) * forward * min(
+                0.02, g.magnitude
+            )
+        if world.state == "docked":
+            break
+    assert world.state == "docked", world.mission.reason
+    assert {"turn_left", "toward", "docked"} <= commands
