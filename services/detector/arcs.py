@@ -95,7 +95,7 @@ def _circumcircle(P: Floats, i: int, j: int, k: int, out: Floats) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _score(P: Floats, U: Floats, S: Floats, left: Ints, n: int, c: Floats, r_share: float) -> float:
+def _score(P: Floats, U: Floats, S: Floats, left: Ints, n: int, c: Floats) -> float:
     """Return a truncated quadratic count of the points on the visible side, less half of those inside the circle."""
     score = 0.0
     step = max(1, n // 150)
@@ -103,7 +103,7 @@ def _score(P: Floats, U: Floats, S: Floats, left: Ints, n: int, c: Floats, r_sha
         i = left[q]
         dx, dy = P[i, 0] - c[0], P[i, 1] - c[1]
         d = np.sqrt(dx * dx + dy * dy)
-        tol = S[i] + r_share * c[2]
+        tol = S[i] + 0.08 * min(c[2], 0.15)
         e = (d - c[2]) / tol
         if abs(e) < 1.0:
             facing = dx * U[i, 0] + dy * U[i, 1]
@@ -145,7 +145,7 @@ def _seed(
                 break
         if k < 0 or not _circumcircle(P, i, j, k, c) or not r_min <= c[2] <= r_max:
             continue
-        score = _score(P, U, S, left, n, c, 0.08)
+        score = _score(P, U, S, left, n, c)
         if score > top:
             top = score
             best[0], best[1], best[2] = c[0], c[1], c[2]
