@@ -15,7 +15,14 @@ from services.common.config import TreedockConfig
 from services.evaluate.bench import BenchOptions, BenchReport, code_version
 from services.evaluate.trees import Score, read_trees, read_truth, rmse, score
 
-_SIMULATOR = ("services.simulator", "services.common.geometry")
+_SIMULATOR = (
+    "services.common.geometry",
+    *(f"services.simulator.{name}" for name in (
+        "scene", "planting", "catalogue", "meshes", "world", "texture", "render", "sensor", "camera", "path", "truth",
+        "write",
+    )),
+)  # fmt: skip
+"""What decides the rendered images: the flying part of the simulator does not."""
 _CODE = (
     "schemas", "services.common", "services.camera", "services.slam", "services.mapper", "services.detector", *_SIMULATOR,
     "services.evaluate.offline", "services.evaluate.trees", "services.evaluate.bench_catalogue",
