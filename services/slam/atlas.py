@@ -42,6 +42,9 @@ class Points(NamedTuple):
     visible: I32
     born: I32
     """(P,) serial of the keyframe that made it."""
+    parallax: F64
+    """(P,) of a point begun far away: sum over its keyframes of (sideways distance from the first / octave's scale)
+    squared; -1 for a point with measured depth."""
 
 
 class Keyframes(NamedTuple):
@@ -53,6 +56,8 @@ class Keyframes(NamedTuple):
     uv: NDArray[np.float32]
     depth: NDArray[np.float32]
     disparity: NDArray[np.float32]
+    far: NDArray[np.bool_]
+    """Beyond the sensor's range."""
     info: NDArray[np.float32]
     """Inverse variance of the disparity."""
     octave: NDArray[np.int32]
@@ -73,7 +78,7 @@ def _points(n: int) -> Points:
     return Points(
         np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n), np.zeros(n), np.zeros((n, 4), np.uint64),
         np.zeros((n, m), np.int32), np.zeros((n, m), np.int32), np.zeros(n, np.int32), np.zeros(n, np.int32),
-        np.zeros(n, np.int32), np.zeros(n, np.int32),
+        np.zeros(n, np.int32), np.zeros(n, np.int32), np.full(n, -1.0),
     )  # fmt: skip
 
 
@@ -81,7 +86,7 @@ def _keyframes(k: int, n: int, cells: int) -> Keyframes:
     f32, i32 = np.float32, np.int32
     return Keyframes(
         np.zeros((k, 3, 3)), np.zeros((k, 3)), np.zeros((k, n, 2), f32), np.zeros((k, n), f32), np.zeros((k, n), f32),
-        np.zeros((k, n), f32),
+        np.zeros((k, n), np.bool_), np.zeros((k, n), f32),
         np.zeros((k, n), i32), np.zeros((k, n), f32), np.zeros((k, n, 4), np.uint64), np.full((k, n), -1, i32),
         np.zeros(k, i32), np.full(k, -1, i32), np.zeros((k, cells + 1), i32), np.zeros((k, n), i32),
     )  # fmt: skip
@@ -140,7 +145,7 @@ class Atlas:
         k, n, kf = int(free[0]), len(features), self.keyframes
         kf.R[k], kf.t[k], kf.n[k], kf.serial[k] = R, t, n, self._serial
         kf.uv[k, :n], kf.depth[k, :n], kf.disparity[k, :n] = features.uv, features.depth, features.disparity
-        kf.info[k, :n] = features.info
+        kf.far[k, :n], kf.info[k, :n] = features.far, features.info
         kf.octave[k, :n], kf.angle[k, :n], kf.desc[k, :n] = features.octave, features.angle, features.desc
         kf.cell_start[k], kf.cell_items[k, :n] = features.cell_start, features.cell_items
         kf.point[k] = -1
@@ -153,7 +158,7 @@ class Atlas:
         kf, n = self.keyframes, int(self.keyframes.n[k])
         return Features(
             kf.uv[k, :n].astype(float), kf.octave[k, :n].copy(), kf.angle[k, :n].astype(float), kf.desc[k, :n].copy(),
-            kf.depth[k, :n].astype(float), kf.disparity[k, :n].astype(float), kf.info[k, :n].astype(float), kf.cell_start[k].copy(),
+            kf.depth[k, :n].astype(float), kf.disparity[k, :n].astype(float), kf.far[k, :n].copy(), kf.info[k, :n].astype(float), kf.cell_start[k].copy(),
             kf.cell_items[k, :n].copy(),
         )  # fmt: skip
 
@@ -262,6 +267,22 @@ def describe(points: Points, kf: Keyframes, p: int, scales: F64) -> None:
     _, _, _, d = direction(points, kf, p, k)
     points.far[p] = d * scales[kf.octave[k, i]]
     points.near[p] = points.far[p] / scales[len(scales) - 1]
+    points.parallax[p] = parallax(points, kf, p, scales) if kf.far[k, i] else -1.0
+
+
+@njit(cache=True, nogil=True)
+def parallax(points: Points, kf: Keyframes, p: int, scales: F64) -> float:
+    """Return ``Points.parallax`` of a point: what its keyframes know of its distance, but for the focal length."""
+    ax, ay, az, a = direction(points, kf, p, points.frame[p, 0])
+    total = 0.0
+    for j in range(1, points.n[p]):
+        k = points.frame[p, j]
+        bx, by, bz, _ = direction(points, kf, p, k)
+        x, y, z = ax - bx, ay - by, az - bz
+        along = (x * ax + y * ay + z * az) / a
+        sideways2 = max(x * x + y * y + z * z - along * along, 0.0)
+        total += sideways2 / scales[kf.octave[k, points.feature[p, j]]] ** 2
+    return total
 
 
 @njit(cache=True, nogil=True)
@@ -276,14 +297,19 @@ def direction(points: Points, kf: Keyframes, p: int, k: int) -> tuple[float, flo
 
 @njit(cache=True, nogil=True)
 def create_points(
-    points: Points, kf: Keyframes, k: int, slots: I32, camera: F64, low_m: float, high_m: float, scales: F64
-) -> int:
-    """Make a point of each feature of ``k`` that has depth in range and no point yet; return how many."""
+    points: Points, kf: Keyframes, k: int, slots: I32, camera: F64, low_m: float, high_m: float, far_m: float,
+    scales: F64,
+) -> int:  # fmt: skip
+    """Make a point of each feature of ``k`` without one that has depth in range, or is far; return how many."""
     made = 0
     R, t = kf.R[k], kf.t[k]
     for i in range(kf.n[k]):
         z = kf.depth[k, i]
-        if kf.point[k, i] >= 0 or z < low_m or z > high_m:
+        if kf.far[k, i]:
+            z = far_m
+        elif z < low_m or z > high_m:
+            continue
+        if kf.point[k, i] >= 0:
             continue
         if made == len(slots):
             break

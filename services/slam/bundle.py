@@ -289,10 +289,11 @@ def adjust_large(problem: Problem, camera: F64, free: int, iterations: int, robu
 
 
 @njit(cache=True, nogil=True)
-def build(points: Points, kf: Keyframes, ids: I32, slots: I32, index: I32, variance: F64) -> Problem:
+def build(points: Points, kf: Keyframes, ids: I32, slots: I32, index: I32, variance: F64, far: F64) -> Problem:
     """Gather points ``ids`` and keyframes ``slots`` (``index`` (K,): place in ``slots``, -1: not in) into a Problem.
 
-    ``variance`` (levels,) of u and v by octave, pixels squared.
+    ``variance`` (levels,) of u and v by octave, pixels squared; ``far`` (2,) disparity and its inverse variance that stand in
+    for the unknown depth in the first observation of a far point.
     """
     total = 0
     for p in ids:
@@ -316,6 +317,8 @@ def build(points: Points, kf: Keyframes, ids: I32, slots: I32, index: I32, varia
             obs[o, 0], obs[o, 1], obs[o, 2] = kf.uv[k, i, 0], kf.uv[k, i, 1], kf.disparity[k, i]
             info[o, 0] = 1.0 / variance[kf.octave[k, i]]
             info[o, 1] = kf.info[k, i]
+            if j == 0 and kf.far[k, i]:
+                obs[o, 2], info[o, 1] = far[0], far[1]
             o += 1
         start[m + 1] = o
     return Problem(R, t, X, start, pose, obs, info, np.ones(total, np.bool_))

@@ -18,10 +18,12 @@ from services.slam.config import SlamConfig
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 U8 = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
 
 CELL_PX = 20.0
 """Side of the search grid's cells."""
 _AROUND_PX = 3
+_VOID_PX = 16
 _EDGE_PX = 19
 """No feature nearer to the image's edge: the descriptor's patch would leave it."""
 
@@ -41,6 +43,8 @@ class Features:
     """(N,) metres, 0 = none."""
     disparity: F64
     """(N,) fx * baseline / depth, 0 = none."""
+    far: Bool
+    """(N,) without depth in an area without depth: beyond the sensor's range."""
     info: F64
     """(N,) inverse variance of the disparity, 0 = none."""
     cell_start: I32
@@ -81,19 +85,21 @@ def spread(xy: F64, response: F64, keep: int, width: int, height: int) -> NDArra
 @njit(cache=True, nogil=True)
 def sample_depth(
     depth_m: NDArray[np.float32], xy: F64, low_m: float, high_m: float, bf: float, sigma: float
-) -> tuple[F64, F64]:
-    """Return depth (N,) at pixels, 0 = none, and the inverse variance (N,) of the disparity ``bf / depth``.
+) -> tuple[F64, F64, Bool]:
+    """Return depth (N,) at pixels, 0 = none, the inverse variance (N,) of ``bf / depth``, and which are far (N,).
 
     To the sensor's ``sigma`` comes half the range of disparities around the pixel: beside an edge, on a steep surface or
     where colour and depth were not taken at the same instant nobody knows which of them the feature has.
     """
     height, width = depth_m.shape
-    out, info = np.zeros(len(xy)), np.zeros(len(xy))
+    out, info, far = np.zeros(len(xy)), np.zeros(len(xy)), np.zeros(len(xy), np.bool_)
     for i in range(len(xy)):
         c, r = int(xy[i, 0] + 0.5), int(xy[i, 1] + 0.5)
         if c < _AROUND_PX or r < _AROUND_PX or c >= width - _AROUND_PX or r >= height - _AROUND_PX:
             continue
         z = depth_m[r, c]
+        if z <= 0.0:
+            far[i] = is_void(depth_m, c, r)
         if z < low_m or z > high_m:
             continue
         nearest = farthest = z
@@ -105,7 +111,18 @@ def sample_depth(
         half = 0.5 * (bf / nearest - bf / farthest)
         out[i] = z
         info[i] = 1.0 / (sigma * sigma + half * half)
-    return out, info
+    return out, info, far
+
+
+@njit(cache=True, nogil=True)
+def is_void(depth_m: NDArray[np.float32], c: int, r: int) -> bool:
+    """Return whether no pixel in a wide area round (c, r) has depth (every fourth is asked)."""
+    height, width = depth_m.shape
+    for y in range(max(r - _VOID_PX, 0), min(r + _VOID_PX + 1, height), 4):
+        for x in range(max(c - _VOID_PX, 0), min(c + _VOID_PX + 1, width), 4):
+            if depth_m[y, x] > 0.0:
+                return False
+    return True
 
 
 @njit(cache=True, nogil=True)
@@ -163,12 +180,12 @@ class Extractor:
         pick = spread(table[:, :2], table[:, 2], self._config.features, width, height)
         xy = np.ascontiguousarray(table[pick, :2])
         desc = np.ascontiguousarray(descriptors[pick]).view(np.uint64)
-        depth, info = sample_depth(
+        depth, info, far = sample_depth(
             depth_m, xy, self._config.min_depth_m, 10.0 * self._config.max_depth_m, self._bf,
             self._config.disparity_sigma_px,
         )  # fmt: skip
         uv = self.undistort(xy)
-        return self._build(uv, octave[pick], np.deg2rad(table[pick, 3]), desc, depth, info)
+        return self._build(uv, octave[pick], np.deg2rad(table[pick, 3]), desc, depth, info, far)
 
     def undistort(self, xy: F64) -> F64:
         """Return undistorted pixels (N, 2)."""
@@ -182,9 +199,19 @@ class Extractor:
 
     def _empty(self) -> Features:
         zero = np.zeros(0)
-        return self._build(np.zeros((0, 2)), np.zeros(0, np.int32), zero, np.zeros((0, 4), np.uint64), zero, zero)
+        return self._build(
+            np.zeros((0, 2)),
+            np.zeros(0, np.int32),
+            zero,
+            np.zeros((0, 4), np.uint64),
+            zero,
+            zero,
+            np.zeros(0, np.bool_),
+        )
 
-    def _build(self, uv: F64, octave: I32, angle: F64, desc: NDArray[np.uint64], depth: F64, info: F64) -> Features:
+    def _build(
+        self, uv: F64, octave: I32, angle: F64, desc: NDArray[np.uint64], depth: F64, info: F64, far: Bool
+    ) -> Features:
         disparity = np.where(depth > 0.0, self._bf / np.where(depth > 0.0, depth, 1.0), 0.0)
         start, items = grid_of(uv, self._cols, self._rows)
-        return Features(uv, octave, angle, desc, depth, disparity, info, start, items)
+        return Features(uv, octave, angle, desc, depth, disparity, far, info, start, items)

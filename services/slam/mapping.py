@@ -72,6 +72,7 @@ class Mapping:
             self.camera.array,
             config.min_depth_m,
             config.max_depth_m,
+            config.far_m,
             atlas.scales,
         )
         born = np.full(made, atlas.newest_serial, np.int32)
@@ -122,7 +123,7 @@ class Mapping:
         slots = np.concatenate([free, fixed]).astype(np.int32)
         index = np.full(len(kf.n), -1, np.int32)
         index[slots] = np.arange(len(slots))
-        problem = build(atlas.points, kf, ids, slots, index, camera.variance)
+        problem = build(atlas.points, kf, ids, slots, index, camera.variance, camera.far)
         solve = adjust if len(free) <= _COMPILED_KEYFRAMES else adjust_large
         solve(problem, camera.array, len(free), robust_iterations, robust=True)
         gate(chi_squares(problem, camera.array), problem.info, 1.0, problem.use)

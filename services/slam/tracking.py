@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from services.slam.atlas import Atlas, Points, neighbours, points_of, shared_counts
+from services.slam.atlas import Atlas, Keyframes, Points, neighbours, points_of, shared_counts
 from services.slam.binary import match_all
 from services.slam.camera import CameraModel
 from services.slam.config import SlamConfig
@@ -62,7 +62,7 @@ class Tracking:
             match = self._match_last(last, features, R, t, world, usable, widen * _WINDOW_LAST_PX)
             if np.count_nonzero(match >= 0) < _ENOUGH * widen:
                 continue
-            found = self._locate(features, R, t, world, match, known)
+            found = self._locate(features, R, t, world, match, known, last)
             if found is not None and found.inliers >= 0.5 * _ENOUGH:
                 return found
         return self._follow_blind(last, features, world, known, usable)
@@ -72,12 +72,21 @@ class Tracking:
         known = np.where(last.point >= 0, last.point, -1)
         known[(known >= 0) & (self.atlas.points.n[known] == 0)] = -1
         f, cam = last.features, self.camera.array
-        z = f.depth
+        z = np.where(f.far, self.config.far_m, f.depth)
         local = np.stack([(f.uv[:, 0] - cam[2]) * z / cam[0], (f.uv[:, 1] - cam[3]) * z / cam[1], z], axis=1)
         world = (local - last.t) @ last.R
         has = known >= 0
         world[has] = self.atlas.points.pos[known[has]]
         return world, known, has | (z > 0.0)
+
+    def _doubt_of_last(self, known: I32, features: I32, last: Tracked | None, R: F64, t: F64) -> F64:
+        """Return the doubt (M,) of the last frame's ``features``: of map points ``known``, or (-1) temporary ones."""
+        atlas, focal, sigma = self.atlas, self.camera.array[0], self.config.far_sigma_inverse_m
+        doubt = far_doubt(atlas.points, atlas.keyframes, known, R, t, focal, sigma)
+        if last is not None:
+            step_m = moved(R, t, last.R, last.t)[0]
+            doubt[(known < 0) & last.features.far[features]] = (focal * step_m * sigma) ** 2
+        return doubt
 
     def _match_last(
         self, last: Tracked, features: Features, R: F64, t: F64, world: F64, usable: Bool, window_px: float
@@ -93,12 +102,15 @@ class Tracking:
         keep_common_turn(match, f.angle, features.angle)
         return match
 
-    def _locate(self, features: Features, R: F64, t: F64, world: F64, match: I32, known: I32) -> Tracked | None:
+    def _locate(
+        self, features: Features, R: F64, t: F64, world: F64, match: I32, known: I32, last: Tracked | None
+    ) -> Tracked | None:
         """Refine a pose over matches (query -> feature); the result holds the inliers that are map points."""
         queries = np.flatnonzero(match >= 0)
         index = match[queries]
         R, t = R.copy(), t.copy()
-        count, use, H, chi2 = self.refine(features, R, t, world[queries], index)
+        doubt = self._doubt_of_last(known[queries], queries.astype(np.int32), last, R, t)
+        count, use, H, chi2 = self.refine(features, R, t, world[queries], index, doubt)
         if count < 6:
             return None
         point = np.full(len(features), -1, np.int32)
@@ -106,12 +118,17 @@ class Tracking:
         point[index[good]] = known[queries[good]]
         return Tracked(features, R, t, point, count, H, chi2)
 
-    def refine(self, features: Features, R: F64, t: F64, world: F64, index: NDArray) -> tuple[int, Bool, F64, float]:
-        """Refine ``R``, ``t`` in place from ``world`` (M, 3) seen at features ``index``: inliers, which, information, chi2."""
+    def refine(
+        self, features: Features, R: F64, t: F64, world: F64, index: NDArray, doubt: F64
+    ) -> tuple[int, Bool, F64, float]:
+        """Refine ``R``, ``t`` in place from ``world`` (M, 3) seen at features ``index``: inliers, which, information, chi2.
+
+        ``doubt`` (M,) is the variance, pixels squared, that a point's unknown distance adds to where it is seen.
+        """
         cam = self.camera
         disparity = features.disparity[index]
         obs = np.column_stack([features.uv[index], disparity])
-        info = np.column_stack([1.0 / cam.variance[features.octave[index]], features.info[index]])
+        info = np.column_stack([1.0 / (cam.variance[features.octave[index]] + doubt), features.info[index]])
         use, H = np.ones(len(index), np.bool_), np.zeros((6, 6))
         if len(index) < 6:
             return 0, use, H, 0.0
@@ -127,9 +144,11 @@ class Tracking:
         match = np.full(len(world), -1, np.int32)
         match[queries] = part
         keep_common_turn(match, last.features.angle, features.angle)
-        return self.locate_by_ransac(features, world, match, known)
+        return self.locate_by_ransac(features, world, match, known, last)
 
-    def locate_by_ransac(self, features: Features, world: F64, match: I32, known: I32) -> Tracked | None:
+    def locate_by_ransac(
+        self, features: Features, world: F64, match: I32, known: I32, last: Tracked | None = None
+    ) -> Tracked | None:
         """Locate a frame without any prior from 3D-2D matches (query -> feature): AP3P in RANSAC, then refinement."""
         import cv2
 
@@ -148,7 +167,7 @@ class Tracking:
         R, _ = cv2.Rodrigues(r)
         kept = np.full_like(match, -1)
         kept[queries[inliers[:, 0]]] = match[queries[inliers[:, 0]]]
-        return self._locate(features, np.ascontiguousarray(R), np.ascontiguousarray(t[:, 0]), world, kept, known)
+        return self._locate(features, np.ascontiguousarray(R), np.ascontiguousarray(t[:, 0]), world, kept, known, last)
 
     def join_map(self, frame: Tracked) -> tuple[Tracked, int] | None:
         """Match the frame with the local map and refine; returns it and its best keyframe slot, None when that fails."""
@@ -182,7 +201,8 @@ class Tracking:
         point[match[got]] = ids[got]
         index = np.flatnonzero(point >= 0)
         R, t = frame.R.copy(), frame.t.copy()
-        count, use, H, chi2 = self.refine(f, R, t, p.pos[point[index]], index)
+        doubt = far_doubt(p, self.atlas.keyframes, point[index], R, t, cam.array[0], self.config.far_sigma_inverse_m)
+        count, use, H, chi2 = self.refine(f, R, t, p.pos[point[index]], index, doubt)
         if tally:
             p.visible[ids[~np.isnan(place[:, 0])]] += 1
             p.visible[frame.point[frame.point >= 0]] += 1
@@ -200,6 +220,28 @@ class Tracking:
         for k in first[:4]:
             chosen.extend(neighbours(atlas, int(k), 30, 5))
         return np.array(list(dict.fromkeys(int(k) for k in chosen)), np.int32)
+
+
+@njit(cache=True, nogil=True)
+def far_doubt(points: Points, kf: Keyframes, ids: I32, R: F64, t: F64, focal: float, sigma: float) -> F64:
+    """Return the variance (M,), pixels squared, of where points are seen from ``R``, ``t`` for want of their distance.
+
+    A distance known to ``s`` (inverse metres) only shifts the image by ``focal * s`` per metre away from the keyframe that
+    first saw the point. Zero for points with measured depth and for -1.
+    """
+    out = np.zeros(len(ids))
+    for i in range(len(ids)):
+        p = ids[i]
+        if p < 0 or points.parallax[p] < 0.0:
+            continue
+        k = points.frame[p, 0]
+        step2 = 0.0
+        for c in range(3):
+            a = kf.R[k, 0, c] * kf.t[k, 0] + kf.R[k, 1, c] * kf.t[k, 1] + kf.R[k, 2, c] * kf.t[k, 2]
+            b = R[0, c] * t[0] + R[1, c] * t[1] + R[2, c] * t[2]
+            step2 += (a - b) ** 2
+        out[i] = focal**2 * step2 / (1.0 / sigma**2 + focal**2 * points.parallax[p])
+    return out
 
 
 @njit(cache=True, nogil=True)
