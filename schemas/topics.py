@@ -91,7 +91,7 @@ _LATEST, _STREAM, _ADVANCED, _QUERY = Delivery.LATEST, Delivery.STREAM, Delivery
 ANY = "*"
 """Every service (health, liveness)."""
 
-CAMERA_RGBD = Topic("camera/rgbd", RgbdFrame, "camera", ("slam", "refiner"), 15, 1.0, _H, _LATEST, "data",
+CAMERA_RGBD = Topic("camera/rgbd", RgbdFrame, "camera", ("slam", "refiner", "navigator"), 15, 1.0, _H, _LATEST, "data",
                     description="colour and registered depth, raw")  # fmt: skip
 CAMERA_COMPRESSED = Topic("camera/rgbd_compressed", RgbdFrame, "camera", ("recorder",), 0, None, _A, _LATEST, "data_low",
                           description="the same as JPEG and PNG, sent only while somebody listens")  # fmt: skip

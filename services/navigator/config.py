@@ -133,6 +133,10 @@ class NavigatorConfig(BaseModel):
     """Distance from the trunk's axis at which undocking ends."""
     aircraft_radius_m: float = Field(default=0.35, gt=0.0)
     safety_radius_m: float = Field(default=0.80, gt=0.0)
+    live_guard: bool = True
+    """Brake for whatever the depth image shows in the way, mapped or not."""
+    guard_height_m: float = Field(default=0.25, gt=0.0)
+    """Half height of the aircraft with margin, for the live guard."""
     preflight_wait_s: float = Field(default=30.0, gt=0.0)
     arm_wait_s: float = Field(default=20.0, gt=0.0)
     takeoff_wait_s: float = Field(default=30.0, gt=0.0)

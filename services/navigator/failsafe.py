@@ -13,7 +13,9 @@ from typing import Literal
 import numpy as np
 
 from schemas.navigation import MissionStateName
+from services.common.geometry import Matrix
 from services.navigator.board import Board
+from services.navigator.guard import Sweep, free_way_m
 from services.navigator.path import clearance_m
 from services.navigator.track import Step
 
@@ -26,6 +28,11 @@ AIRBORNE: frozenset[MissionStateName] = frozenset(
 _VISUAL: frozenset[MissionStateName] = frozenset({"approach", "dock"})
 _NEEDS_LIST: frozenset[MissionStateName] = frozenset({"scan", "select", "face"})
 _BODY_MARGIN_M = 0.10
+_MOVING_M_S = 0.05
+_VIEW_FRESH_S = 0.5
+_REACTION_S = 0.5
+_TARGET_BARK_M = 0.45
+"""Surfaces this near to the target's axis are the trunk: the largest suitable radius, and the map's error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +57,8 @@ class Watch:
     armed: bool = False
     """The vehicle was armed in offboard for this mission."""
     ground_seen: bool = False
+    blocked_way: Matrix | None = None
+    """Direction (2,) in map in which the live guard braked, while it is blocked."""
     _jumped_ns: int | None = None
     _jump_word: str = ""
     _map_id: str | None = field(default=None)
@@ -57,7 +66,7 @@ class Watch:
     def begin(self, mission_id: int) -> None:
         """Forget the last mission."""
         self.mission_id, self.engaged, self.armed = mission_id, False, False
-        self.ground_seen, self._jumped_ns, self._map_id = False, None, None
+        self.ground_seen, self._jumped_ns, self._map_id, self.blocked_way = False, None, None, None
 
     def check(self, board: Board, state: MissionStateName, resume: MissionStateName) -> Fault | None:
         """Return the most pressing fault, or None. ``resume`` is the state a hold interrupts."""
@@ -205,16 +214,35 @@ def _trees(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
 
 
 def _obstacle(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
-    del w, doing
-    here = b.here
-    if here is None or float(np.linalg.norm(b.trajectory.velocity_m_s)) < 0.05:
+    del doing
+    here, velocity = b.here, b.trajectory.velocity_m_s[:2]
+    if here is None:
         return None
+    speed = float(np.linalg.norm(velocity))
+    if w.blocked_way is not None and _free_way(b, w.blocked_way) < b.config.safety_radius_m:
+        return Fault("obstacle", "hold", "something stands in the way", b.config.failsafe.obstacle_hold_s)
+    w.blocked_way = None
+    if speed < _MOVING_M_S:
+        return None
+    braking = speed * _REACTION_S + speed * speed / b.config.motion.max_accel_m_s2
+    if _free_way(b, velocity) < b.config.aircraft_radius_m + _BODY_MARGIN_M + braking:
+        w.blocked_way = velocity / speed
+        return Fault("obstacle", "hold", "something stands in the way", b.config.failsafe.obstacle_hold_s)
     discs = b.discs(b.config.aircraft_radius_m + _BODY_MARGIN_M)
-    ahead = here.position_m[:2] + b.trajectory.velocity_m_s[:2]
-    now, then = clearance_m(here.position_m[:2], discs), clearance_m(ahead, discs)
+    now, then = clearance_m(here.position_m[:2], discs), clearance_m(here.position_m[:2] + velocity, discs)
     if then >= 0.0 or then >= now:
         return None
     return Fault("obstacle", "hold", "a trunk stands in the way", b.config.failsafe.obstacle_hold_s)
+
+
+def _free_way(b: Board, way: Matrix) -> float:
+    """Return how far the depth image says the way is free, inf when there is none to say so."""
+    c, here, seen = b.config, b.here, b.inputs.view
+    if not c.live_guard or here is None or seen is None or b.inputs.age_s(seen) > _VIEW_FRESH_S:
+        return float("inf")
+    target = None if b.axis_m is None else b.axis_m - here.position_m[:2]
+    sweep = Sweep(c.aircraft_radius_m + _BODY_MARGIN_M, c.guard_height_m, _TARGET_BARK_M)
+    return free_way_m(seen.message, way, target, sweep)
 
 
 def _ground_link(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:

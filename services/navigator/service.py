@@ -7,10 +7,14 @@ import os
 from collections.abc import Callable
 from typing import get_args
 
+import numpy as np
+
+from schemas.camera import RgbdFrame
 from schemas.command import Command, CommandName, CommandReply, NonceReply, NonceRequest
 from schemas.health import Health
 from schemas.slam import Pose
 from schemas.topics import (
+    CAMERA_RGBD,
     COMMAND,
     COMMAND_NONCE,
     HEALTH,
@@ -26,6 +30,7 @@ from schemas.vehicle import VehicleState
 from services.common.context import Context
 from services.navigator.commands import CommandDesk
 from services.navigator.config import NavigatorConfig
+from services.navigator.guard import View, look
 from services.navigator.mission import Mission
 from services.navigator.values import Inputs, Outputs, Seen
 
@@ -34,6 +39,8 @@ LOG = logging.getLogger(__name__)
 WATCHED = ("camera", "slam", "mapper", "detector", "refiner", "autopilot", "station")
 """Services whose health the failsafes look at."""
 _STATE_EVERY = 4
+_GUARDED = frozenset({"approach", "dock", "return", "hold"})
+"""States with a way ahead that the camera looks along."""
 
 
 class Navigator:
@@ -47,6 +54,7 @@ class Navigator:
         self._trees: Seen[TreeList] | None = None
         self._target: Seen[Target] | None = None
         self._vehicle: Seen[VehicleState] | None = None
+        self._view: Seen[View] | None = None
         self._services: dict[str, int] = {}
         self._steps = self._states = 0
 
@@ -54,6 +62,8 @@ class Navigator:
         """Connect to the bus."""
         c = self._context
         c.on(SLAM_POSE, self._on_pose)
+        if self.mission.config.live_guard:
+            c.on(CAMERA_RGBD, self._on_frame)
         c.on(TREES_LIST, self._on_trees)
         c.on(TREES_TARGET, self._on_target)
         c.on(VEHICLE_STATE, self._on_vehicle)
@@ -67,7 +77,7 @@ class Navigator:
     def step(self) -> None:
         """Step the mission and publish what it says."""
         now_ns = self._context.clock.now_ns()
-        inputs = Inputs(now_ns, self._pose, self._trees, self._target, self._vehicle, dict(self._services))
+        inputs = Inputs(now_ns, self._pose, self._trees, self._target, self._vehicle, dict(self._services), self._view)
         with self._context.health.timed("step"):
             outputs = self.mission.step(inputs)
         self._publish(outputs)
@@ -89,6 +99,17 @@ class Navigator:
 
     def _on_pose(self, pose: Pose) -> None:
         self._pose = Seen(pose, self._context.clock.now_ns())
+
+    def _on_frame(self, frame: RgbdFrame) -> None:
+        """Look at the depth while there is a way to guard; frames of other encodings are not for us."""
+        here = self.mission.board.track.latest
+        if self.mission.state not in _GUARDED or here is None or frame.depth_encoding != "z16":
+            return
+        size = (frame.intrinsics.height, frame.intrinsics.width)
+        with self._context.health.timed("guard"):
+            depth = np.frombuffer(frame.depth, dtype="<u2").reshape(size)
+            view = look(depth, frame.intrinsics, here.T_map_camera[:3, :3], frame.stamp_ns)
+        self._view = Seen(view, self._context.clock.now_ns())
 
     def _on_trees(self, trees: TreeList) -> None:
         self._trees = Seen(trees, self._context.clock.now_ns())

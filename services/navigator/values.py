@@ -10,6 +10,7 @@ from schemas.navigation import Guidance, GuidanceCommand, MissionState, MissionS
 from schemas.slam import Pose
 from schemas.trees import Target, TreeList
 from schemas.vehicle import VehicleState
+from services.navigator.guard import View
 from services.navigator.trajectory import Aim
 
 T = TypeVar("T")
@@ -33,6 +34,8 @@ class Inputs:
     target: Seen[Target] | None = None
     vehicle: Seen[VehicleState] | None = None
     services: Mapping[str, int] = field(default_factory=dict)
+    view: Seen[View] | None = None
+    """What the depth image shows, for the live guard."""
 
     def age_s(self, seen: Seen[T] | None) -> float:
         """Return the seconds since a message came, inf when none did."""

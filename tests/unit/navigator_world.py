@@ -12,6 +12,7 @@ from schemas.trees import Target, Tree, TreeList
 from schemas.vehicle import VehicleState
 from services.common.geometry import Matrix, level_camera, rotation_z, to_transform, wrap_angle
 from services.navigator.config import NavigatorConfig
+from services.navigator.guard import View
 from services.navigator.mission import Mission
 from services.navigator.values import Event, Inputs, Outputs, Seen
 
@@ -57,6 +58,8 @@ class World:
     station: bool = False
     revision: int = 0
     """Of the list of trees: raise it after changing them."""
+    walker: Matrix | None = None
+    """Somebody (x, y) whom the camera sees and the map does not know."""
     events: list[Event] = field(default_factory=list)
     outputs: Outputs | None = None
     armings: int = 0
@@ -87,7 +90,9 @@ class World:
         self.now_ns += round(STEP_S * 1e9)
         self._steps += 1
         self._sense()
-        inputs = Inputs(self.now_ns, self._pose, self._trees, self._target, self._vehicle, dict(self._seen_ns))
+        inputs = Inputs(
+            self.now_ns, self._pose, self._trees, self._target, self._vehicle, dict(self._seen_ns), self._view()
+        )
         self.outputs = self.mission.step(inputs)
         self.events.extend(self.outputs.events)
         self._actuate(self.outputs)
@@ -121,6 +126,15 @@ class World:
             self._trees = Seen(self._list(listed), self.now_ns)
         if not self.vehicle_silent:
             self._vehicle = Seen(self._vehicle_message(), self.now_ns)
+
+    def _view(self) -> Seen[View]:
+        points = np.zeros((0, 3))
+        if self.walker is not None:
+            offset = self.walker - self.position_m[:2]
+            spread = np.linspace(-0.2, 0.2, 20)
+            points = np.stack([offset[0] + spread, offset[1] + spread[::-1], 0.0 * spread], axis=1)
+            points = points @ rotation_z(self.shift_yaw_rad).T
+        return Seen(View(self.now_ns, points), self.now_ns)
 
     def _pose_message(self, status: SlamStatus) -> Pose:
         T = level_camera(self.believed(self.position_m), wrap_angle(self.yaw_rad + self.shift_yaw_rad))
