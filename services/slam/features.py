@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from schemas.camera import Intrinsics
 from services.slam.config import SlamConfig
+from services.slam.detect import EDGE_PX, Detector
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
@@ -24,8 +25,6 @@ CELL_PX = 20.0
 """Side of the search grid's cells."""
 _AROUND_PX = 3
 _VOID_PX = 16
-_EDGE_PX = 19
-"""No feature nearer to the image's edge: the descriptor's patch would leave it."""
 
 
 @dataclass(slots=True)
@@ -52,34 +51,6 @@ class Features:
 
     def __len__(self) -> int:
         return len(self.uv)
-
-
-@njit(cache=True, nogil=True)
-def spread(xy: F64, response: F64, keep: int, width: int, height: int) -> NDArray[np.int64]:
-    """Return at most ``keep`` indices, strong and even: round by round the next best of each image cell.
-
-    Cells are about as many as half of the features wanted; ties fall to the earlier index.
-    """
-    n = len(xy)
-    side = max(8.0, np.sqrt(width * height / max(0.5 * keep, 1.0)))
-    cols, rows = int(width / side) + 1, int(height / side) + 1
-    order = np.argsort(-response, kind="mergesort")
-    rank = np.empty(n, np.int64)
-    filled = np.zeros(cols * rows, np.int64)
-    for index in order:
-        cell = int(xy[index, 1] / side) * cols + int(xy[index, 0] / side)
-        rank[index] = filled[cell]
-        filled[cell] += 1
-    out = np.empty(min(keep, n), np.int64)
-    count = 0
-    level = 0
-    while count < len(out):
-        for index in order:
-            if rank[index] == level and count < len(out):
-                out[count] = index
-                count += 1
-        level += 1
-    return np.sort(out)
 
 
 @njit(cache=True, nogil=True)
@@ -162,30 +133,47 @@ class Extractor:
         self._bf = intrinsics.fx * config.baseline_m
         make_orb: Any = cv2.ORB_create  # type: ignore[attr-defined]  # missing from the stubs
         self._orb: Any = make_orb(
-            nfeatures=int(2.0 * config.features), scaleFactor=config.scale, nlevels=config.levels,
-            edgeThreshold=_EDGE_PX, patchSize=31, fastThreshold=config.fast_threshold_low,
-        )  # fmt: skip
+            nfeatures=config.features, scaleFactor=config.scale, nlevels=config.levels, edgeThreshold=EDGE_PX - 1
+        )
+        self._make_keypoint: Any = cv2.KeyPoint
+        # quotas are rounded level by level
+        self._detector = Detector(
+            config.features - config.levels,
+            config.levels,
+            config.scale,
+            config.fast_threshold,
+            config.fast_threshold_low,
+        )
+        self._scales = config.scale ** np.arange(config.levels, dtype=float)
         self._K = np.array([[intrinsics.fx, 0.0, intrinsics.cx], [0.0, intrinsics.fy, intrinsics.cy], [0.0, 0.0, 1.0]])
         self._distortion = np.array([intrinsics.k1, intrinsics.k2, intrinsics.p1, intrinsics.p2, intrinsics.k3])
         self._cols, self._rows = grid_size(intrinsics)
 
     def extract(self, grey: U8, depth_m: NDArray[np.float32]) -> Features:
         """Return the features of an image (H, W) with its depth (H, W)."""
-        keypoints, descriptors = self._orb.detectAndCompute(grey, None)
-        if not keypoints:
-            return self._empty()
-        table = np.array([(*k.pt, k.response, k.angle, k.octave) for k in keypoints])
-        octave = table[:, 4].astype(np.int32)
-        height, width = grey.shape
-        pick = spread(table[:, :2], table[:, 2], self._config.features, width, height)
-        xy = np.ascontiguousarray(table[pick, :2])
-        desc = np.ascontiguousarray(descriptors[pick]).view(np.uint64)
+        xy, whole, angle, octave = self._detector.detect(grey, depth_m)
+        desc, kept = self._describe(grey, whole, angle, octave)
+        xy, angle, octave = xy[kept], angle[kept], octave[kept]
         depth, info, far = sample_depth(
             depth_m, xy, self._config.min_depth_m, 10.0 * self._config.max_depth_m, self._bf,
             self._config.disparity_sigma_px,
         )  # fmt: skip
-        uv = self.undistort(xy)
-        return self._build(uv, octave[pick], np.deg2rad(table[pick, 3]), desc, depth, info, far)
+        return self._build(self.undistort(xy), octave, angle, desc, depth, info, far)
+
+    def _describe(self, grey: U8, xy: F64, angle: F64, octave: I32) -> tuple[NDArray[np.uint64], NDArray[np.int64]]:
+        """Return descriptors (M, 4) and which corners (M,) they belong to: OpenCV drops those it finds near the edge."""
+        make, size, degrees = self._make_keypoint, 31.0 * self._scales[octave], np.degrees(angle) % 360.0
+        keypoints = [
+            make(x, y, s, a, 1.0, o, i)
+            for i, (x, y, s, a, o) in enumerate(
+                zip(xy[:, 0].tolist(), xy[:, 1].tolist(), size.tolist(), degrees.tolist(), octave.tolist(), strict=True)
+            )
+        ]
+        kept, descriptors = self._orb.compute(grey, keypoints)
+        if descriptors is None:
+            return np.zeros((0, 4), np.uint64), np.zeros(0, np.int64)
+        which = np.array([k.class_id for k in kept], np.int64)
+        return np.ascontiguousarray(descriptors).view(np.uint64), which
 
     def undistort(self, xy: F64) -> F64:
         """Return undistorted pixels (N, 2)."""
@@ -196,18 +184,6 @@ class Extractor:
         criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-9)
         out = cv2.undistortPoints(xy[:, None, :], self._K, self._distortion, None, None, self._K, criteria)
         return np.ascontiguousarray(out[:, 0, :])
-
-    def _empty(self) -> Features:
-        zero = np.zeros(0)
-        return self._build(
-            np.zeros((0, 2)),
-            np.zeros(0, np.int32),
-            zero,
-            np.zeros((0, 4), np.uint64),
-            zero,
-            zero,
-            np.zeros(0, np.bool_),
-        )
 
     def _build(
         self, uv: F64, octave: I32, angle: F64, desc: NDArray[np.uint64], depth: F64, info: F64, far: Bool
