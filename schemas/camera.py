@@ -17,6 +17,11 @@ DepthEncoding = Literal["z16", "png", "zstd"]
 COLOUR_ENCODINGS: tuple[ColourEncoding, ...] = ("bgr8", "jpeg", "none")
 DEPTH_ENCODINGS: tuple[DepthEncoding, ...] = ("z16", "png", "zstd")
 MAX_SIDE_PX = 4096
+_MAX_FOCAL_PX = 1e6
+_MAX_DISTORTION = 1e4
+MIN_DEPTH_SCALE, MAX_DEPTH_SCALE = 0.1, 1e6
+"""Units per metre: from 10 m to a micrometre a unit."""
+MAX_ACCEL_MPS2 = 1e5
 
 
 class Intrinsics(Part):
@@ -27,16 +32,16 @@ class Intrinsics(Part):
 
     width: int = Field(gt=0, le=MAX_SIDE_PX)
     height: int = Field(gt=0, le=MAX_SIDE_PX)
-    fx: float = Field(gt=0)
-    fy: float = Field(gt=0)
-    cx: float
-    cy: float
-    k1: float = 0.0
-    k2: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
-    k3: float = 0.0
-    depth_scale: float = Field(default=1000.0, gt=0)
+    fx: float = Field(ge=1.0, le=_MAX_FOCAL_PX)
+    fy: float = Field(ge=1.0, le=_MAX_FOCAL_PX)
+    cx: float = Field(ge=-_MAX_FOCAL_PX, le=_MAX_FOCAL_PX)
+    cy: float = Field(ge=-_MAX_FOCAL_PX, le=_MAX_FOCAL_PX)
+    k1: float = Field(default=0.0, ge=-_MAX_DISTORTION, le=_MAX_DISTORTION)
+    k2: float = Field(default=0.0, ge=-_MAX_DISTORTION, le=_MAX_DISTORTION)
+    p1: float = Field(default=0.0, ge=-_MAX_DISTORTION, le=_MAX_DISTORTION)
+    p2: float = Field(default=0.0, ge=-_MAX_DISTORTION, le=_MAX_DISTORTION)
+    k3: float = Field(default=0.0, ge=-_MAX_DISTORTION, le=_MAX_DISTORTION)
+    depth_scale: float = Field(default=1000.0, ge=MIN_DEPTH_SCALE, le=MAX_DEPTH_SCALE)
 
     @property
     def distorted(self) -> bool:
@@ -151,5 +156,5 @@ def _check(frame: RgbdFrame) -> None:
         raise DecodeError(f"rgbd frame with the negative stamp {frame.stamp_ns}")
     if not 0.0 < frame.render_scale <= 1.0:
         raise DecodeError(f"rgbd frame with render scale {frame.render_scale}, expected above 0 and at most 1")
-    if frame.accel_camera is not None and not all(math.isfinite(a) for a in frame.accel_camera):
+    if frame.accel_camera is not None and not all(abs(a) <= MAX_ACCEL_MPS2 for a in frame.accel_camera):
         raise DecodeError(f"rgbd frame with acceleration {frame.accel_camera}")

@@ -128,7 +128,9 @@ def test_bad_images_come_as_bad_frames_with_their_file(tmp_path: Path) -> None:
     [
         ({"fx": None}, "fx"), ({"fx": -1.0}, "fx"), ({"fx": "wide"}, "fx"), ({"fy": 0}, "fy"), ({"cx": float("nan")}, "cx"),
         ({"cx": 900.0}, "cx"), ({"cy": -3.0}, "cy"), ({"width": 0}, "width"), ({"width": 48.5}, "width"), ({"height": "32"}, "height"),
-        ({"depth_scale": 0}, "depth_scale"), ({"depth_scale": float("inf")}, "depth_scale"), ({"k1": "x"}, "k1"), ({"k9": 1.0}, "k9"),
+        ({"depth_scale": 0}, "depth_scale"), ({"depth_scale": float("inf")}, "depth_scale"), ({"k1": "x"}, "k1"), ({"k9": 1.0}, "k9: unknown name"),
+        ({"depth_scale": 0.001}, "depth_scale: .*units per metre"), ({"depth_scale": 1e300}, "depth_scale"), ({"fx": 1e300}, "fx"),
+        ({"fy": 1.5}, "fy: 1.5 px is no focal length"), ({"fx": 9e4}, "fx: .* is no focal length"), ({"k1": 1e200}, "k1"),
     ],
 )  # fmt: skip
 def test_each_field_of_camera_json_is_checked(tmp_path: Path, change: dict[str, Any], fault: str) -> None:
@@ -166,6 +168,7 @@ def test_camera_json_that_is_no_object_is_refused(tmp_path: Path, content: str) 
         ("associations.txt", "1.0 a 1.0 b\n1.0 a 1.0 b\n", "two frames with the stamp"),
         ("accelerometer.txt", "1.0 0 nan 0\n", r"accelerometer\.txt:1: 'nan'"),
         ("accelerometer.txt", "1.0 0 0\n", "3 fields"),
+        ("accelerometer.txt", "1.0 0 1e308 0\n", r"accelerometer\.txt:1: .* is no acceleration"),
     ],
 )
 def test_broken_lists_are_refused_by_file_and_line(tmp_path: Path, name: str, content: str, fault: str) -> None:
@@ -173,6 +176,21 @@ def test_broken_lists_are_refused_by_file_and_line(tmp_path: Path, name: str, co
     (folder / name).write_text(content)
     with pytest.raises(InputError, match=fault):
         TumSource(folder, CONFIG)
+
+
+def test_a_name_that_no_file_can_have_is_a_bad_frame(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "s", 1)
+    (folder / "associations.txt").write_text("1.0 rgb/a\0b 1.0 depth/c\n")
+    (item,) = TumSource(folder, CONFIG)
+    assert isinstance(item, BadFrame)
+    assert r"a\x00b" in item.reason
+
+
+def test_a_byte_order_mark_is_no_fault(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "s", 2)
+    for name in ("camera.json", "rgb.txt"):
+        (folder / name).write_bytes(b"\xef\xbb\xbf" + (folder / name).read_bytes())
+    assert len(list(TumSource(folder, CONFIG))) == 2
 
 
 def test_missing_and_empty_folders_are_refused(tmp_path: Path) -> None:

@@ -86,6 +86,30 @@ def test_results_appear_whole_or_not_at_all(tmp_path: Path) -> None:
     assert [p.name for p in out.parent.iterdir()] == ["out"]
 
 
+def test_results_go_into_the_present_folder_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for out in (Path(), Path(".."), tmp_path):
+        prepare(out)
+        write_files(out, {"a": b"1"})
+        assert (out / "a").read_bytes() == b"1"
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+    (tmp_path.parent / "a").unlink()
+
+
+def test_the_folder_above_out_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Path] = []
+    mkdir = Path.mkdir
+    monkeypatch.setattr(Path, "mkdir", lambda self, *a, **k: (made.append(self), mkdir(self, *a, **k))[1])
+    (tmp_path / "out").mkdir()
+    write_files(tmp_path / "out", {"a": b"1"})
+    assert made[1].parent == tmp_path / "out", "it may be closed to this user, or another disk"
+
+
+def test_an_out_with_an_impossible_name_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be written: File name too long"):
+        prepare(tmp_path / ("x" * 300))
+
+
 def test_an_out_that_is_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "f").write_text("")
     with pytest.raises(InputError, match="is a file"):

@@ -12,7 +12,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.camera import MAX_ACCEL_MPS2
 from services.camera.sources.text import read_rows, stamp_ns_of
+from services.common.errors import InputError
 
 SIGNS_CAMERA_FROM_FILE = np.array([-1.0, -1.0, 1.0])
 _LONGEST_WINDOW_NS = 200_000_000
@@ -38,6 +40,9 @@ class Accelerometer:
         stamps = [stamp_ns_of(row, 0, path) for row in rows]
         values = [[row.number(column, path) for column in (1, 2, 3)] for row in rows]
         force = np.array(values, dtype=float).reshape(-1, 3) * SIGNS_CAMERA_FROM_FILE
+        for row, value in zip(rows, values, strict=True):
+            if max(map(abs, value)) > MAX_ACCEL_MPS2:
+                raise InputError(f"{path}:{row.line}: {value} is no acceleration in m/s^2")
         return cls(np.array(stamps, dtype=np.int64), force)
 
     def mean_between(self, after_ns: int, until_ns: int) -> tuple[float, float, float] | None:

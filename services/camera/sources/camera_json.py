@@ -11,6 +11,8 @@ from schemas.camera import Intrinsics
 from services.common.errors import InputError
 
 _REQUIRED = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")
+_MIN_FOCAL, _MAX_FOCAL = 0.05, 100.0
+"""Focal length in image sides: views from 169 down to half a degree wide."""
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
@@ -20,7 +22,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
         InputError: naming the file, the field, its value and what was expected.
     """
     try:
-        body = json.loads(path.read_text(encoding="utf-8"))
+        body = json.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise InputError(f"{path}: no such file; name the camera's intrinsics with --camera FILE") from None
     except (OSError, UnicodeDecodeError) as error:
@@ -35,10 +37,20 @@ def read_intrinsics(path: Path) -> Intrinsics:
     try:
         intrinsics = Intrinsics.model_validate(body)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        field = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{path}: {field}: {first['msg']} (found {str(first['input'])[:40]!r})") from None
-    for name, value, side in (("cx", intrinsics.cx, intrinsics.width), ("cy", intrinsics.cy, intrinsics.height)):
-        if not 0.0 <= value <= side:
-            raise InputError(f"{path}: {name}: {value} is outside the image of {side} px")
+        raise InputError(f"{path}: {_fault(error)}") from None
+    i = intrinsics
+    for axis, focal_px, centre_px, side_px in (("x", i.fx, i.cx, i.width), ("y", i.fy, i.cy, i.height)):
+        if not 0.0 <= centre_px <= side_px:
+            raise InputError(f"{path}: c{axis}: {centre_px} is outside the image of {side_px} px")
+        if not _MIN_FOCAL * side_px <= focal_px <= _MAX_FOCAL * side_px:
+            raise InputError(f"{path}: f{axis}: {focal_px} px is no focal length for an image of {side_px} px")
     return intrinsics
+
+
+def _fault(error: ValidationError) -> str:
+    first = error.errors(include_url=False)[0]
+    field = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        return f"{field}: unknown name; known are {', '.join(Intrinsics.model_fields)}"
+    hint = "; units per metre were expected, 1000 for millimetres" if field == "depth_scale" else ""
+    return f"{field}: {first['msg']} (found {repr(first['input'])[:40]}{hint})"

@@ -35,7 +35,7 @@ def read_rows(path: Path, columns: int, what: str) -> list[Row]:
         InputError: the file is missing, no text, or a line has another number of fields.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (OSError, UnicodeDecodeError) as error:

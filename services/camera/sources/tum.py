@@ -114,8 +114,8 @@ def _decoded(path: Path, decode: Callable[[bytes, int, int], T], camera: Intrins
         raise FrameError(f"{path}: no such file") from None
     except OSError as error:
         raise FrameError(f"{path}: cannot be read: {error.strerror}") from None
-    except FrameError as error:
-        raise FrameError(f"{path}: {error}") from None
+    except ValueError as error:  # a FrameError, or a name that no file can have
+        raise FrameError(f"{str(path)!a}: {error}" if "\0" in str(path) else f"{path}: {error}") from None
 
 
 def _pairs(folder: Path, config: CameraConfig) -> list[Pair]:
