@@ -9,13 +9,16 @@ import numpy as np
 from services.detector.checks import axis_at, base_point, prolonged_top_m, shape_fault, space_above_was_seen
 from services.detector.config import DetectorConfig
 from services.detector.cylinders import Cylinder, fit_cylinder
-from services.detector.forks import Fork, find_forks
+from services.detector.forks import Arm, Fork, find_forks
 from services.detector.model import Floats, Ground, Rejection, Trunk, Views
 from services.detector.stacks import Stack
 from services.detector.upright import Upright
 from services.detector.voxels import Voxels
 
 BREAST_HEIGHT_M = 1.3
+_NO_CYLINDER = "no cylinder through its slices"
+_ARM_LAYERS = 5
+"""Slices that show a fork's second arm, though no cylinder could be fitted to it (the first stands in the way)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,13 +52,16 @@ def judge(stacks: list[Stack], around: Surroundings) -> tuple[list[Trunk], list[
     """Return the trunks, sorted by distance from the input's origin in the plan, and what was dropped and why."""
     kept: list[Candidate] = []
     rejections: list[Rejection] = []
+    unsure: list[Arm] = []
     for stack in stacks:
         found = _examine(stack, kept, around)
         if isinstance(found, Rejection):
             rejections.append(found)
+            if found.reason == _NO_CYLINDER and stack.layers >= _ARM_LAYERS:
+                unsure.append(Arm.of_stack(stack))
         else:
             kept.append(found)
-    kept, joined = _join_forks(kept, around)
+    kept, joined = _join_forks(kept, unsure, around)
     rejections.extend(joined)
     trunks = [_as_trunk(c, around) for c in kept]
     trunks.sort(key=lambda t: (np.hypot(t.base_m[0], t.base_m[1]), t.base_m))
@@ -66,7 +72,7 @@ def _examine(stack: Stack, kept: list[Candidate], around: Surroundings) -> Candi
     config = around.config
     cylinder = fit_cylinder(around.voxels, stack, config)
     if cylinder is None:
-        return _rejection(stack.at_m, stack.radius_m, stack.layers, "too few points for a cylinder", around.frame)
+        return _rejection(stack.at_m, stack.radius_m, stack.layers, _NO_CYLINDER, around.frame)
     base = base_point(cylinder, around.ground)
     low, high = cylinder.z_low_m - base[2], cylinder.z_high_m - base[2]
     top = high
@@ -104,25 +110,29 @@ def _twin_fault(cylinder: Cylinder, kept: list[Candidate]) -> str:
     return ""
 
 
-def _join_forks(kept: list[Candidate], around: Surroundings) -> tuple[list[Candidate], list[Rejection]]:
+def _join_forks(
+    kept: list[Candidate], unsure: list[Arm], around: Surroundings
+) -> tuple[list[Candidate], list[Rejection]]:
     """Make one tree of each pair of arms; arms above a stem that is a candidate itself are dropped."""
     gone: set[int] = set()
     joined: list[Rejection] = []
     merged: list[Candidate] = []
-    for fork in find_forks([c.cylinder for c in kept], around.ground):
+    arms = [Arm.of_cylinder(c.cylinder) for c in kept] + unsure
+    for fork in find_forks(arms, len(kept), around.ground):
         if fork.first in gone or fork.second in gone:
             continue
-        arms = (fork.first, fork.second)
-        gone.update(arms)
-        stem = next((k for k, c in enumerate(kept) if k not in arms and _stands_below(c, fork)), None)
-        for arm in arms if stem is not None else arms[1:]:
-            c = kept[arm].cylinder
+        pair = [k for k in (fork.first, fork.second) if k < len(kept)]
+        gone.update((fork.first, fork.second))
+        stem = next((k for k, c in enumerate(kept) if k not in pair and _stands_below(c, fork)), None)
+        for k in pair if stem is not None else pair[1:]:
+            c = kept[k].cylinder
             reason = f"an arm of a tree that forks {fork.height_m:.1f} m above ground"
             joined.append(
-                _rejection(kept[arm].base, c.radius_m, round((c.z_high_m - c.z_low_m) / 0.1), reason, around.frame)
+                _rejection(kept[k].base, c.radius_m, round((c.z_high_m - c.z_low_m) / 0.1), reason, around.frame)
             )
         if stem is None:
-            merged.append(_forked(kept[fork.first], kept[fork.second], fork, around.ground))
+            axis = arms[fork.first].axis + arms[fork.second].axis
+            merged.append(_forked([kept[k] for k in pair], axis / np.linalg.norm(axis), fork, around.ground))
     return [c for k, c in enumerate(kept) if k not in gone] + merged, joined
 
 
@@ -132,14 +142,13 @@ def _stands_below(candidate: Candidate, fork: Fork) -> bool:
     return below and float(np.linalg.norm(at[:2] - fork.at_m[:2])) < candidate.cylinder.radius_m + 0.05
 
 
-def _forked(a: Candidate, b: Candidate, fork: Fork, ground: Ground) -> Candidate:
-    """Return one tree of two arms: it stands below the fork, upright, as thick as the thicker arm."""
-    thick = a if a.cylinder.radius_m >= b.cylinder.radius_m else b
-    axis = a.cylinder.axis + b.cylinder.axis
+def _forked(arms: list[Candidate], axis: Floats, fork: Fork, ground: Ground) -> Candidate:
+    """Return one tree of its arms: it stands below the fork, as thick as the thickest arm."""
+    thick = max(arms, key=lambda c: c.cylinder.radius_m)
     base = np.array([fork.at_m[0], fork.at_m[1], ground.height_m(float(fork.at_m[0]), float(fork.at_m[1]))])
     return replace(
-        thick, cylinder=replace(thick.cylinder, axis=axis / np.linalg.norm(axis)), base=base, fork_m=max(fork.height_m, 0.0),
-        low_m=min(a.low_m, b.low_m), high_m=max(a.high_m, b.high_m), top_m=max(a.top_m, b.top_m),
+        thick, cylinder=replace(thick.cylinder, axis=axis), base=base, fork_m=max(fork.height_m, 0.0),
+        low_m=min(c.low_m for c in arms), high_m=max(c.high_m for c in arms), top_m=max(c.top_m for c in arms),
     )  # fmt: skip
 
 

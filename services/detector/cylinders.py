@@ -224,13 +224,23 @@ def _priors(radius: float) -> Floats:
     """Return mean and inverse variance of (x, y, slope x, slope y, radius, taper) in the axis frame of a candidate."""
     slope = 1.0 / (4 * _PRIOR_SLOPE) ** 2
     return np.array([
-        [0.0, 1e-6], [0.0, 1e-6], [0.0, slope], [0.0, slope], [radius, 1.0 / (0.2 * radius + 0.01) ** 2],
+        [0.0, 1e-6], [0.0, 1e-6], [0.0, slope], [0.0, slope], [radius, 1.0 / (0.12 * radius + 0.006) ** 2],
         [_MEAN_TAPER, 1.0 / _PRIOR_TAPER**2],
     ])  # fmt: skip
 
 
+def _margin_m(stack: Stack, config: DetectorConfig) -> float:
+    """Return how far outside the surface points may belong to it: by the sensor's noise, where the range is known.
+
+    Wider, and the neighbour's points (a bush, the other arm of a fork) pull the fit.
+    """
+    if stack.range_m == 0.0:
+        return max(0.12, 0.4 * stack.radius_m)
+    return 0.04 + 0.1 * stack.radius_m + 2.5 * config.range_noise_per_m * stack.range_m**2
+
+
 def fit_cylinder(voxels: Voxels, stack: Stack, config: DetectorConfig) -> Cylinder | None:
-    """Return the joint fit of a candidate, or None when too few points remain or it leaves its place."""
+    """Return the joint fit of a candidate, or None when too few points remain or it leaves its slices."""
     at, slope, radius = stack.at_m.copy(), stack.slope.copy(), stack.radius_m
     prior, normal = _priors(radius), np.zeros((6, 6))
     buffer = np.empty(len(voxels.xyz_m), dtype=np.int64)
@@ -239,7 +249,7 @@ def fit_cylinder(voxels: Voxels, stack: Stack, config: DetectorConfig) -> Cylind
     G = np.zeros(0)
     scale = 1.0 if voxels.seen_from else 3.0  # without views the noise is not known beforehand
     for turn in range(2):
-        reach = radius + max(0.12, 0.4 * radius) + (0.1 if voxels.seen_from else 0.0)
+        reach = radius + _margin_m(stack, config)
         z0, z1 = stack.z_low_m - 0.15, stack.z_high_m + 0.15
         n = int(_near(voxels.xyz_m, at[0], at[1], at[2], slope[0], slope[1], reach, z0, z1, buffer))
         if n < 15:
@@ -255,7 +265,7 @@ def fit_cylinder(voxels: Voxels, stack: Stack, config: DetectorConfig) -> Cylind
         at = at + R.T @ np.array([x[0], x[1], 0.0])
         axis = R.T @ np.array([x[2], x[3], 1.0])
         slope, radius = axis[:2] / axis[2], float(x[4])
-        if np.hypot(*slope) > 1.5:
+        if np.hypot(*slope) > 1.5 or abs(radius - stack.radius_m) > 0.35 * stack.radius_m + 0.01:
             return None
     return _measured(P, U, G, x, scale, at, slope, normal, config)
 

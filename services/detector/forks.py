@@ -6,9 +6,34 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.detector.checks import axis_at
 from services.detector.cylinders import Cylinder
 from services.detector.model import Floats, Ground
+from services.detector.stacks import Stack
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """An axis that may be one arm of a fork, upright frame."""
+
+    at_m: Floats
+    axis: Floats
+    radius_m: float
+    z_low_m: float
+
+    @classmethod
+    def of_cylinder(cls, c: Cylinder) -> Arm:
+        """Return the arm of a fitted cylinder."""
+        return cls(c.at_m, c.axis, c.radius_m, c.z_low_m)
+
+    @classmethod
+    def of_stack(cls, s: Stack) -> Arm:
+        """Return the arm that a line of slices shows."""
+        axis = np.array([s.slope[0], s.slope[1], 1.0])
+        return cls(s.at_m, axis / np.linalg.norm(axis), s.radius_m, s.z_low_m)
+
+    def point(self, z_m: float) -> Floats:
+        """Return the axis point (3,) at a height."""
+        return self.at_m + self.axis * ((z_m - self.at_m[2]) / self.axis[2])
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +47,7 @@ class Fork:
     """Above ground."""
 
 
-def _closest(a: Cylinder, b: Cylinder) -> tuple[float, float]:
+def _closest(a: Arm, b: Arm) -> tuple[float, float]:
     """Return the height z at which two axes are nearest in the plan, and that distance."""
     sa, sb = a.axis[:2] / a.axis[2], b.axis[:2] / b.axis[2]
     apart = (b.at_m[:2] - sb * b.at_m[2]) - (a.at_m[:2] - sa * a.at_m[2])
@@ -34,21 +59,23 @@ def _closest(a: Cylinder, b: Cylinder) -> tuple[float, float]:
     return z, float(np.linalg.norm(apart + spread * z))
 
 
-def find_forks(cylinders: list[Cylinder], ground: Ground, min_angle_rad: float = 0.14) -> list[Fork]:
+def find_forks(arms: list[Arm], sure: int, ground: Ground, min_angle_rad: float = 0.14) -> list[Fork]:
     """Return pairs of arms: axes at an angle that meet below both arms, between a little under ground and 2 m above.
 
-    Trees that merely stand close have axes that pass each other, or meet far below the ground.
+    Only the first ``sure`` arms are trunks; the others can be the second arm of one of those. Trees that merely stand close have axes that pass each other, or meet far below the ground.
     """
     forks = []
-    for i, a in enumerate(cylinders):
-        for j in range(i + 1, len(cylinders)):
-            b = cylinders[j]
+    for i, a in enumerate(arms[:sure]):
+        for j in range(i + 1, len(arms)):
+            b = arms[j]
+            if not 0.5 < a.radius_m / b.radius_m < 2.0:
+                continue
             if float(np.arccos(min(1.0, float(a.axis @ b.axis)))) < min_angle_rad:
                 continue
             z, distance = _closest(a, b)
             if distance > 0.5 * (a.radius_m + b.radius_m) + 0.02 or z > min(a.z_low_m, b.z_low_m) + 0.25:
                 continue
-            at = 0.5 * (axis_at(a, z) + axis_at(b, z))
+            at = 0.5 * (a.point(z) + b.point(z))
             height = z - ground.height_m(float(at[0]), float(at[1]))
             if -0.15 <= height <= 2.0:
                 forks.append(Fork(i, j, at, height))

@@ -21,6 +21,8 @@ class Stack:
     slope: Floats
     """(2,): dx/dz, dy/dz."""
     radius_m: float
+    range_m: float
+    """Typical distance it was seen from, 0 where views are unknown."""
     z_low_m: float
     z_high_m: float
     layers: int
@@ -182,7 +184,7 @@ def _as_stack(circles: Circles, tol_all: Floats, members: Ints) -> Stack:
     layers = circles.layer[members]
     extent = int(layers.max() - layers.min()) + 1
     return Stack(
-        at, slope, float(np.median(radius)), float(xyz[:, 2].min()), float(xyz[:, 2].max()), len(members),
+        at, slope, float(np.median(radius)), float(np.median(circles.range_m[members])), float(xyz[:, 2].min()), float(xyz[:, 2].max()), len(members),
         len(members) / extent,
     )  # fmt: skip
 

@@ -144,3 +144,15 @@ def test_same_input_same_output() -> None:
     first, second = detect_trees(cloud), detect_trees(cloud.copy())
     assert first.trunks == second.trunks
     assert first.rejections == second.rejections
+
+
+def test_a_fork_is_one_unsuitable_tree_and_neighbours_that_lean_apart_are_two() -> None:
+    rng = np.random.default_rng(12)
+    stem = trunk(2.0, 0.0, 0.14, rng, height=0.5)
+    arms = [trunk(2.0 - s * 0.5, 0.0, 0.08, rng, low=0.5, lean=(s, 0.0)) for s in (0.27, -0.27)]
+    (t,) = detect_trees(_scene(stem, *arms)).trunks
+    assert not t.suitable
+    assert t.remark.startswith("forks 0.")
+    assert t.base_m[0] == pytest.approx(2.0, abs=0.05)
+    apart = [trunk(2.0 - s, 0.0, 0.08, rng, lean=(s, 0.0)) for s in (0.27, -0.27)]  # they would meet 1 m under ground
+    assert len(detect_trees(_scene(*apart)).trunks) == 2
