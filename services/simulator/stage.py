@@ -36,6 +36,7 @@ class Stage:
         self._T_map_world = np.eye(4)
         self._fair = fair_trees(self.world, self.path)
         self.begin_map(self.path.at(0.0))
+        self._camera.look(self.path.at(0.0), 0)  # compiles: a work loop that does it later passes for hung
 
     def begin_map(self, T_world_camera: Floats) -> None:
         """Lay the map frame at the first camera pose."""

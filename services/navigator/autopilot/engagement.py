@@ -52,6 +52,8 @@ class Engagement:
         self._ground_since_ns: int | None = None
         self._in_offboard = False
         self._land_seen = False
+        self._mode_before = ""
+        """The mode in which the vehicle stood when we began: the pilot changes it to say no."""
 
     @property
     def streams(self) -> bool:
@@ -72,6 +74,7 @@ class Engagement:
         free = self.phase in ("quiet", "released") and vehicle.heard and not vehicle.armed
         self.mission_id = guidance.mission_id
         if rising and free:
+            self._mode_before = vehicle.mode
             self._go("streaming", f"engaging for mission {guidance.mission_id}", now_ns)
         else:
             why = "it was under way when the bridge was started" if not rising else "the vehicle is not free"
@@ -98,7 +101,13 @@ class Engagement:
         }[self.phase]  # fmt: skip
         return step(vehicle, now_ns)
 
+    def _refused(self, vehicle: Vehicle) -> bool:
+        """Whether the pilot chose another mode while we were asking for offboard."""
+        return vehicle.mode not in (self._mode_before, OFFBOARD)
+
     def _stream(self, vehicle: Vehicle, now_ns: int) -> list[Order]:
+        if self._refused(vehicle):
+            return self._release(vehicle, now_ns)
         if self.usable(now_ns) is None:
             return self._cancel("the navigator took its order back", now_ns)
         ready = vehicle.vision_fused and not vehicle.refusal
@@ -109,6 +118,8 @@ class Engagement:
         return []
 
     def _switch(self, vehicle: Vehicle, now_ns: int) -> list[Order]:
+        if self._refused(vehicle):
+            return self._release(vehicle, now_ns)
         if self.usable(now_ns) is None:
             return self._cancel("the navigator took its order back", now_ns)
         if vehicle.mode == OFFBOARD:
