@@ -67,7 +67,8 @@ class Slam:
         self._reference = -1
         self._anchor: F64 = np.eye(4)
         """T_keyframe_camera of the last tracked frame."""
-        self._since_keyframe = 0
+        self._peak = 0
+        """Most inliers of a frame since the last keyframe."""
         self._log = _Log()
 
     def track(
@@ -139,7 +140,6 @@ class Slam:
             self._step = pose(frame.R, frame.t) @ inverse(pose(self._last.R, self._last.t))
         new: list[NewKeyframe] = []
         graph = None
-        self._since_keyframe += 1
         if self._needs_keyframe(frame):
             new, graph = self._make_keyframe(frame)
         self._set_anchor(frame)
@@ -161,7 +161,7 @@ class Slam:
         kf = self.atlas.keyframes
         frame.R, frame.t = kf.R[k].copy(), kf.t[k].copy()
         frame.point = kf.point[k, : len(frame.features)].copy()
-        self._since_keyframe = 0
+        self._peak = 0
         self.graph_version += 1
         return [NewKeyframe(int(kf.serial[k]), inverse(pose(frame.R, frame.t)))], self._graph(reason)
 
@@ -175,19 +175,15 @@ class Slam:
     def _needs_keyframe(self, frame: Tracked) -> bool:
         if self.graph_version == 0:
             return True
-        config, atlas = self.config, self.atlas
+        config = self.config
         f = frame.features
         close = (f.depth >= config.min_depth_m) & (f.depth <= config.max_depth_m)
         tracked = int(np.count_nonzero(close & (frame.point >= 0)))
         untracked = int(np.count_nonzero(close & (frame.point < 0)))
         if tracked < config.close_tracked_min and untracked > config.close_untracked_max:
             return True
-        k = atlas.slot_of(self._reference)
-        ids = atlas.keyframes.point[k]
-        ids = ids[ids >= 0]
-        least = 2 if len(atlas.slots) > 2 else 1
-        reference = int(np.count_nonzero(atlas.points.n[ids] >= least))
-        return frame.inliers < config.keyframe_ratio * reference
+        self._peak = max(self._peak, frame.inliers)
+        return frame.inliers < config.keyframe_ratio * self._peak
 
     def polish(self) -> GraphUpdate | None:
         """Adjust the whole map once, when there is time for it; return the new graph, None when nothing was there."""
