@@ -50,7 +50,7 @@ class DockConfig(BaseModel):
     leave_m: float = Field(default=1.5, gt=0.0)
     """Dock falls back to approach beyond this distance."""
     integral_per_s: float = Field(default=0.25, ge=0.0)
-    """Slow correction of a standing offset between setpoint and camera; 0 switches it off."""
+    """How fast a standing offset between setpoint and camera is learnt and taken out; 0 switches it off."""
     integral_limit_m: float = Field(default=0.20, ge=0.0)
     timeout_s: float = Field(default=60.0, gt=0.0)
     hold_s: float = Field(default=4.0, ge=0.0)

@@ -33,6 +33,8 @@ _REPLAN_S = 1.0
 _YAW_LEAD_NS = 300_000_000
 """The aircraft's yaw follows its setpoint by about this much later."""
 _YAW_INTEGRAL_SHARE = 0.4
+_SETTLED_M_S = 0.06
+"""Standing offsets are learnt below this speed of the setpoint: while it moves, the aircraft's lag is no offset."""
 _YAW_CORRECTION_RAD = float(np.radians(8.0))
 
 
@@ -279,11 +281,11 @@ def _station(b: Board, distance_m: float, bearing_rad: float) -> Aim:
     c = b.config
     assert b.axis_m is not None
     assert b.dock_direction is not None
-    near = abs(distance_m - c.dock.aim_m) < 0.3
-    if near and b.target is not None and b.target.measured:
-        gain = c.dock.integral_per_s * b.dt_s
-        limit = c.dock.integral_limit_m
-        b.dock_offset_m = float(np.clip(b.dock_offset_m + gain * (c.dock.aim_m - distance_m), -limit, limit))
+    settled = float(np.linalg.norm(b.trajectory.velocity_m_s)) < _SETTLED_M_S
+    if settled and b.target is not None and b.target.measured:
+        gain, limit = c.dock.integral_per_s * b.dt_s, c.dock.integral_limit_m
+        standing = float(np.linalg.norm(b.trajectory.position_m[:2] - b.axis_m)) - distance_m
+        b.dock_offset_m = float(np.clip(b.dock_offset_m + gain * (standing - b.dock_offset_m), -limit, limit))
         turned = b.dock_yaw_rad + _YAW_INTEGRAL_SHARE * gain * bearing_rad
         b.dock_yaw_rad = float(np.clip(turned, -_YAW_CORRECTION_RAD, _YAW_CORRECTION_RAD))
     place = b.axis_m + b.dock_direction * (c.dock.aim_m + b.dock_offset_m)
