@@ -12,10 +12,14 @@ import typer
 from services.cli.options import AsJson, ConfigFile
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from services.detector.config import DetectorConfig
     from services.detector.model import DetectionResult
     from services.detector.vertical import Vertical
 
-METHODS = ("slicing",)
+METHODS = ("slicing", "slicing-reference", "cylinder")
 
 
 def detect(
@@ -41,7 +45,6 @@ def detect(
     _check_writable(out)
     settings = load_config(config).detector.slicing
 
-    from services.detector.detect import detect_trees
     from services.detector.readers import read_cloud
     from services.detector.report import as_tree
     from services.detector.vertical import Vertical, find_vertical
@@ -49,7 +52,7 @@ def detect(
 
     read = read_cloud(cloud)
     vertical = Vertical(direction, "as told") if direction else find_vertical(read.points_m, settings)
-    result = detect_trees(read.points_m, vertical.up, None, settings)
+    result = _run(method, read.points_m, vertical.up, settings)
     trees = [as_tree(t, i + 1, t.layers) for i, t in enumerate(result.trunks)]
     if out is not None:
         _write(out, trees_json(trees, "input"))
@@ -59,6 +62,22 @@ def detect(
         if explain:
             body["dropped"] = [_dropped(result, i) for i in range(len(result.rejections))]
         typer.echo(json.dumps(body))
+
+
+def _run(
+    method: str, points_m: NDArray[np.float64], up: tuple[float, float, float], settings: DetectorConfig
+) -> DetectionResult:
+    if method == "slicing-reference":
+        from services.detector.reference import detect_reference
+
+        return detect_reference(points_m, up)
+    if method == "cylinder":
+        from services.detector.ransac_cylinder import detect_cylinders
+
+        return detect_cylinders(points_m, up)
+    from services.detector.detect import detect_trees
+
+    return detect_trees(points_m, up, None, settings)
 
 
 def _parse_up(text: str | None) -> tuple[float, float, float] | None:

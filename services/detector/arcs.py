@@ -1,11 +1,4 @@
-"""Circles in slices: RANSAC seeds, then a geometric fit with residuals along the viewing ray.
-
-Depth noise lies along the ray. A radial residual turns it into a bias: points before and behind the surface both
-pull the circle thinner on a one-sided arc. The residual along the ray is the noise itself. With the unit ray ``u``
-(in the plan), the centre ``c`` and the point ``p``: ``a = (c - p) . u``, ``s = (c - p) x u``; the ray enters the
-circle at ``a - sqrt(r^2 - s^2)`` beyond the point. Rays that pass near or beside the rim are continued linearly.
-Without views the residual is radial, ``|p - c| - r`` (Chernov, "Circular and linear regression", 2010, chapter 5).
-"""
+"""Circles in slices: RANSAC seeds, then a geometric fit with residuals along the viewing ray (see ``ray``)."""
 
 from __future__ import annotations
 
@@ -16,10 +9,10 @@ from numba import njit
 
 from services.detector.config import DetectorConfig
 from services.detector.model import Floats, Ints
+from services.detector.ray import point_sigma, residual, solve
+from services.detector.seeds import best_seed
 from services.detector.voxels import Voxels
 
-RIM = 0.92
-"""Share of the radius beyond which the ray residual is continued linearly."""
 _COLUMNS = 10
 """layer, x, y, z, radius, noise, points on, points inside, arc, range."""
 _PER_CLUSTER = 5
@@ -27,154 +20,6 @@ _MOST = 240
 """Points of one circle that its fit uses at most; the joint fit of the trunk uses more."""
 BINS = 36
 """Bins of the arc coverage, 10 degrees each."""
-
-
-@njit(cache=True, nogil=True)
-def residual(px: float, py: float, ux: float, uy: float, cx: float, cy: float, r: float, J: Floats) -> float:
-    """Return the residual of one point and write its derivatives by (cx, cy, r) to ``J``.
-
-    ``(ux, uy)`` is the unit ray in the plan, or (0, 0) for a radial residual. Positive: the point lies before
-    (radially: outside) the surface.
-    """
-    dx, dy = cx - px, cy - py
-    if ux == 0.0 and uy == 0.0:
-        d = max(np.sqrt(dx * dx + dy * dy), 1e-9)
-        J[0] = dx / d
-        J[1] = dy / d
-        J[2] = -1.0
-        return d - r
-    a = dx * ux + dy * uy
-    s = dx * uy - dy * ux
-    side = 1.0 if s >= 0.0 else -1.0
-    rim = RIM * r
-    if abs(s) <= rim:
-        q = np.sqrt(r * r - s * s)
-        J[0] = ux + s / q * uy
-        J[1] = uy - s / q * ux
-        J[2] = -r / q
-        return a - q
-    k = RIM / np.sqrt(1.0 - RIM * RIM)
-    J[0] = ux + k * side * uy
-    J[1] = uy - k * side * ux
-    J[2] = -np.sqrt(1.0 - RIM * RIM) - k * RIM
-    return a - r * np.sqrt(1.0 - RIM * RIM) + k * (abs(s) - rim)
-
-
-@njit(cache=True, nogil=True)
-def point_sigma(s_share: float, range_m: float, ray: bool, k_range: float, surface: float) -> float:
-    """Return the standard deviation of a residual: depth noise, and surface noise seen at a slant.
-
-    ``s_share`` is the distance of the ray from the axis as a share of the radius.
-    """
-    if not ray:
-        return surface
-    cosine = np.sqrt(max(1.0 - s_share * s_share, 0.10))
-    depth = k_range * range_m * range_m
-    return np.sqrt(depth * depth + (surface / cosine) ** 2)
-
-
-@njit(cache=True, nogil=True)
-def _uniform(state: Ints) -> float:
-    """Return the next number in [0, 1) of a 63-bit linear congruential generator."""
-    state[0] = (state[0] * np.int64(2862933555777941757) + np.int64(3037000493)) & np.int64(0x7FFFFFFFFFFFFFFF)
-    return (state[0] >> 11) / 4503599627370496.0
-
-
-@njit(cache=True, nogil=True)
-def _circumcircle(P: Floats, i: int, j: int, k: int, out: Floats) -> bool:
-    ax, ay = P[j, 0] - P[i, 0], P[j, 1] - P[i, 1]
-    bx, by = P[k, 0] - P[i, 0], P[k, 1] - P[i, 1]
-    cross = 2.0 * (ax * by - ay * bx)
-    if abs(cross) < 1e-9:
-        return False
-    a2, b2 = ax * ax + ay * ay, bx * bx + by * by
-    ux, uy = (by * a2 - ay * b2) / cross, (ax * b2 - bx * a2) / cross
-    out[0], out[1] = P[i, 0] + ux, P[i, 1] + uy
-    out[2] = np.sqrt(ux * ux + uy * uy)
-    return True
-
-
-@njit(cache=True, nogil=True)
-def _score(P: Floats, U: Floats, S: Floats, left: Ints, n: int, c: Floats) -> float:
-    """Return a truncated quadratic count of the points on the visible side, less half of those inside the circle."""
-    score = 0.0
-    step = max(1, n // 150)
-    for q in range(0, n, step):
-        i = left[q]
-        dx, dy = P[i, 0] - c[0], P[i, 1] - c[1]
-        d = np.sqrt(dx * dx + dy * dy)
-        tol = S[i] + 0.08 * min(c[2], 0.15)
-        e = (d - c[2]) / tol
-        if abs(e) < 1.0:
-            facing = dx * U[i, 0] + dy * U[i, 1]
-            if facing <= 0.25 * c[2] + tol:
-                score += 1.0 - e * e
-        elif e < 0.0:
-            score -= 0.5
-    return score * step
-
-
-@njit(cache=True, nogil=True)
-def _seed(
-    P: Floats,
-    U: Floats,
-    S: Floats,
-    left: Ints,
-    n: int,
-    state: Ints,
-    trials: int,
-    r_min: float,
-    r_max: float,
-    best: Floats,
-) -> float:
-    """Return the best score of circles through three near points; writes the circle to ``best``."""
-    top = 0.0
-    c = np.empty(3)
-    for _ in range(trials):
-        i = left[min(n - 1, int(_uniform(state) * n))]
-        j, k = -1, -1
-        for _ in range(10):
-            q = left[min(n - 1, int(_uniform(state) * n))]
-            d2 = (P[q, 0] - P[i, 0]) ** 2 + (P[q, 1] - P[i, 1]) ** 2
-            if q in (i, j) or d2 > 4.0 * r_max * r_max:
-                continue
-            if j < 0:
-                j = q
-            else:
-                k = q
-                break
-        if k < 0 or not _circumcircle(P, i, j, k, c) or not r_min <= c[2] <= r_max:
-            continue
-        score = _score(P, U, S, left, n, c)
-        if score > top:
-            top = score
-            best[0], best[1], best[2] = c[0], c[1], c[2]
-    return top
-
-
-@njit(cache=True, nogil=True)
-def solve(A: Floats, y: Floats, x: Floats) -> None:
-    """Solve a small symmetric positive definite system by Cholesky; ``A`` is overwritten."""
-    n = y.shape[0]
-    for i in range(n):
-        for j in range(i + 1):
-            v = A[i, j]
-            for k in range(j):
-                v -= A[i, k] * A[j, k]
-            if i == j:
-                A[i, i] = np.sqrt(max(v, 1e-18))
-            else:
-                A[i, j] = v / A[j, j]
-    for i in range(n):
-        v = y[i]
-        for k in range(i):
-            v -= A[i, k] * x[k]
-        x[i] = v / A[i, i]
-    for i in range(n - 1, -1, -1):
-        v = x[i]
-        for k in range(i + 1, n):
-            v -= A[k, i] * x[k]
-        x[i] = v / A[i, i]
 
 
 @njit(cache=True, nogil=True)
@@ -322,7 +167,7 @@ def _circles_of_cluster(
     circle = np.empty(3)
     rows, first = 0, n
     while rows < out.shape[0] and n >= max(min_points, 0.1 * first):
-        if _seed(P, U, S, left, n, state, trials, r_min, r_max, circle) < 0.5 * min_points:
+        if best_seed(P, U, S, left, n, state, trials, r_min, r_max, circle) < 0.5 * min_points:
             break
         m = _neighbourhood(P, S, left, n, circle, near)
         scale = _refine(P, U, G, near, m, circle, k_range, surface, r_min, r_max)

@@ -13,9 +13,10 @@ import numpy as np
 from numba import njit
 
 from services.common.geometry import rotation_aligning
-from services.detector.arcs import BINS, point_sigma, residual, solve
+from services.detector.arcs import BINS
 from services.detector.config import DetectorConfig
 from services.detector.model import Floats, Ints
+from services.detector.ray import point_sigma, residual, solve
 from services.detector.stacks import Stack
 from services.detector.voxels import Voxels
 

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from services.detector.arcs import RIM, fit_slices, point_sigma, residual, solve
+from services.detector.arcs import fit_slices
 from services.detector.config import DetectorConfig
+from services.detector.ray import RIM, point_sigma, residual, solve
 from services.detector.voxels import Voxels, clusters_per_layer
 
 angles = st.floats(-3.1, 3.1)
