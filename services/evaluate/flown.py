@@ -17,6 +17,7 @@ from services.common.geometry import Matrix, camera_yaw, from_transform, log_rot
 
 WINDOW_S = 3.0
 MIN_M, MAX_M = 0.85, 1.00
+_SAME_TREE_M, _CLOSE_M = 0.5, 1.5
 MAX_HEADING_RAD = math.radians(3.0)
 
 
@@ -107,31 +108,50 @@ def _mean(values: Iterable[float]) -> float | None:
 
 
 def chain_errors(record: Record) -> dict[str, float]:
-    """Return the errors of pose and target against the truth at the same stamps; RMSE and maxima."""
+    """Return the errors of pose and target against the truth at the same stamps: RMSE, mean, maximum.
+
+    ``*_white`` is the part that changes from frame to frame: the RMS of the differences of successive errors, over
+    the root of two.
+    """
     truths = {t.stamp_ns: t for t in record.truths}
-    pose_m, pose_deg = [], []
-    for p in record.poses:
+    lost = sum(p.T_map_camera is None for p in record.poses)
+    figures: dict[str, float] = {"frames": len(record.truths), "poses": len(record.poses), "poses_lost": lost}
+    for name, errors in {**_pose_errors(record.poses, truths), **_target_errors(record.targets, truths)}.items():
+        if not errors:
+            continue
+        e = np.array(errors).reshape(len(errors), -1)
+        size = np.linalg.norm(e, axis=1)
+        figures[f"{name}_rmse"] = round(float(np.sqrt(np.mean(size**2))), 4)
+        figures[f"{name}_max"] = round(float(size.max()), 4)
+        if e.shape[1] == 1:
+            figures[f"{name}_mean"] = round(float(e.mean()), 4)
+        if len(e) > 1:
+            steps = np.diff(e, axis=0)
+            figures[f"{name}_white"] = round(float(np.sqrt(np.mean(np.sum(steps**2, axis=1)) / 2.0)), 4)
+    return figures
+
+
+def _pose_errors(poses: Iterable[Pose], truths: dict[int, SimTruth]) -> dict[str, list[Any]]:
+    """Return the errors of tracked poses: position in map (m, 3), yaw and tilt (degrees)."""
+    found: dict[str, list[Any]] = {"pose_m": [], "yaw_deg": [], "tilt_deg": []}
+    for p in poses:
         true = truths.get(p.stamp_ns)
         if true is None or p.T_map_camera is None:
             continue
         T, T_true = from_transform(p.T_map_camera), from_transform(true.T_map_camera)
-        pose_m.append(float(np.linalg.norm(T[:3, 3] - T_true[:3, 3])))
-        pose_deg.append(math.degrees(np.linalg.norm(log_rotation(T[:3, :3] @ T_true[:3, :3].T))))
-    range_m, bearing_deg = _target_errors(record.targets, truths)
-    lost = sum(p.T_map_camera is None for p in record.poses)
-    figures: dict[str, float] = {"frames": len(record.truths), "poses": len(record.poses), "poses_lost": lost}
-    named = (("pose_m", pose_m), ("pose_deg", pose_deg), ("range_m", range_m), ("bearing_deg", bearing_deg))
-    for name, errors in named:
-        if errors:
-            figures[f"{name}_rmse"] = round(float(np.sqrt(np.mean(np.square(errors)))), 4)
-            figures[f"{name}_mean"] = round(float(np.mean(errors)), 4)
-            figures[f"{name}_max"] = round(float(np.abs(errors).max()), 4)
-    return figures
+        turn = np.degrees(log_rotation(T[:3, :3] @ T_true[:3, :3].T))
+        found["pose_m"].append(T[:3, 3] - T_true[:3, 3])
+        found["yaw_deg"].append(float(turn[2]))
+        found["tilt_deg"].append(float(np.linalg.norm(turn[:2])))
+    return found
 
 
-def _target_errors(targets: Iterable[Target], truths: dict[int, SimTruth]) -> tuple[list[float], list[float]]:
-    """Return errors of range (m) and bearing (deg) of measured frames against the trunk they fit best, within 0.5 m."""
-    range_m, bearing_deg = [], []
+def _target_errors(targets: Iterable[Target], truths: dict[int, SimTruth]) -> dict[str, list[Any]]:
+    """Return errors of range (m) and bearing (deg) of measured frames against the trunk they fit best, within 0.5 m.
+
+    ``close_*``: the same within 1.5 m, where docking is decided.
+    """
+    found: dict[str, list[Any]] = {"range_m": [], "bearing_deg": [], "close_range_m": [], "close_bearing_deg": []}
     for t in targets:
         true = truths.get(t.stamp_ns)
         if true is None or not t.measured or t.range_m is None or t.bearing_rad is None:
@@ -140,7 +160,9 @@ def _target_errors(targets: Iterable[Target], truths: dict[int, SimTruth]) -> tu
         places = [to_axis(T, tree) for tree in true.trees]
         fits = [(math.hypot(d - t.range_m, d * (b - t.bearing_rad)), d, b) for d, b in places]
         off, d, b = min(fits, default=(math.inf, 0.0, 0.0))
-        if off <= 0.5:
-            range_m.append(t.range_m - d)
-            bearing_deg.append(math.degrees(t.bearing_rad - b))
-    return range_m, bearing_deg
+        if off > _SAME_TREE_M:
+            continue
+        for prefix in ("", "close_") if d < _CLOSE_M else ("",):
+            found[f"{prefix}range_m"].append(t.range_m - d)
+            found[f"{prefix}bearing_deg"].append(math.degrees(wrap_angle(t.bearing_rad - b)))
+    return found
