@@ -99,17 +99,27 @@ def _check_writable(out: Path | None) -> None:
 
     if out is None:
         return
-    if out.is_dir():
-        raise InputError(f"--out {out}: is a folder, the name of a file was expected")
-    if not out.absolute().parent.is_dir():
-        raise InputError(f"--out {out}: the folder {out.absolute().parent} does not exist")
+    folder = out.absolute().parent
+    try:
+        if out.is_dir():
+            raise InputError(f"--out {out}: is a folder, the name of a file was expected")
+        if not folder.is_dir():
+            raise InputError(f"--out {out}: the folder {folder} does not exist")
+        if not os.access(out if out.exists() else folder, os.W_OK):
+            raise InputError(f"--out {out}: this user may not write there")
+    except OSError as error:
+        raise InputError(f"--out {out}: cannot be written: {error.strerror}") from None
 
 
 def _write(out: Path, data: bytes) -> None:
-    """Write the whole file or nothing."""
+    """Write the whole file or nothing; a device or a pipe (/dev/null, /dev/stdout) is written to, never replaced."""
     from services.common.errors import InputError
 
-    partial = out.with_name(f".{out.name}.{os.getpid()}.partial")
+    if out.exists() and not out.is_file():
+        out.write_bytes(data)
+        return
+    out = out.resolve()
+    partial = out.with_name(f".{os.getpid()}.partial")
     try:
         with partial.open("wb") as stream:
             stream.write(data)
@@ -131,10 +141,7 @@ def _dropped(result: DetectionResult, index: int) -> dict[str, Any]:
 
 def _tell(result: DetectionResult, vertical: Vertical, refused: int, *, explain: bool, table: bool) -> None:
     """Print the table to stdout (unless JSON goes there), everything else to stderr."""
-    import math
-
     from rich.console import Console
-    from rich.table import Table
 
     notes = Console(stderr=True, highlight=False, soft_wrap=True)
     up = ",".join(f"{v:g}" for v in (round(c, 4) for c in vertical.up))
@@ -142,28 +149,9 @@ def _tell(result: DetectionResult, vertical: Vertical, refused: int, *, explain:
     if refused:
         notes.print(f"{refused} points were refused: not finite")
     if table:
-        grid = Table(title=f"{len(result.trunks)} trees in {result.points} points")
-        for name in (
-            "id",
-            "x m",
-            "y m",
-            "z m",
-            "diameter cm",
-            "at m",
-            "lean deg",
-            "seen to m",
-            "arc deg",
-            "confidence",
-            "",
-        ):
-            grid.add_column(name, justify="right")
-        for i, t in enumerate(result.trunks):
-            grid.add_row(
-                str(i + 1), *(f"{v:.2f}" for v in t.base_m), f"{200 * t.radius_m:.1f} ± {200 * t.sigma_radius_m:.1f}",
-                f"{t.radius_height_m:.1f}", f"{math.degrees(t.lean_rad):.0f}", f"{t.height_seen_m:.1f}",
-                f"{math.degrees(t.arc_rad):.0f}", f"{t.confidence:.2f}", t.remark,
-            )  # fmt: skip
-        Console(highlight=False).print(grid)
+        from services.cli.detect_table import trunk_table
+
+        typer.echo(trunk_table(result.trunks, result.points))
     if explain:
         _explain(result, notes)
 

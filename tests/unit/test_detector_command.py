@@ -1,6 +1,9 @@
 from __future__ import annotations
 
 import json
+import os
+import stat
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -59,6 +62,38 @@ def test_json_on_stdout_finds_the_vertical(forest: Path, tmp_path: Path, capsys:
     assert "vertical 0,1,0" in said.err
 
 
+def test_a_device_or_pipe_is_written_to_never_replaced(forest: Path, tmp_path: Path) -> None:
+    pipe, read = tmp_path / "pipe", []
+    os.mkfifo(pipe)
+    reader = threading.Thread(target=lambda: read.append(pipe.read_bytes()), daemon=True)
+    reader.start()
+    assert invoke(["detect", str(forest), "--out", str(pipe)]) == 0
+    reader.join(timeout=20.0)
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+    assert len(json.loads(read[0])["trees"]) == 2
+
+
+def test_a_link_is_followed(forest: Path, tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    assert invoke(["detect", str(forest), "--out", str(tmp_path / "link")]) == 0
+    assert (tmp_path / "link").is_symlink()
+    assert len(json.loads((tmp_path / "real").read_text())["trees"]) == 2
+
+
+@pytest.mark.parametrize("shift_m", [0.0, -12_345.0, 512_345.0])
+def test_the_table_fits_80_columns_and_cuts_nothing(
+    shift_m: float, forest: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shifted = _save(tmp_path / "shifted.xyz", np.loadtxt(forest) + np.array([shift_m, shift_m, 1500.0]))
+    assert invoke(["detect", str(shifted), "--up", "0,0,1"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert "…" not in "".join(lines)
+    rows = [line.split() for line in lines if line.split() and line.split()[0] in {"1", "2"}]
+    assert [row[0] for row in rows[-2:]] == ["1", "2"]
+    assert any(row[-2:] == ["too", "thick"] for row in rows)
+
+
 def test_no_trees_is_a_result(tmp_path: Path) -> None:
     out = tmp_path / "trees.json"
     assert invoke(["detect", str(_save(tmp_path / "flat.xyz", ground(2.0))), "--out", str(out)]) == 0
@@ -71,7 +106,7 @@ def test_no_trees_is_a_result(tmp_path: Path) -> None:
         (["{}/none.ply"], "no such file"), (["{}/cut.pcd"], "cut short"), (["{}/nan.xyz"], "NaN"),
         (["{}/good.xyz", "--up", "0,0"], "--up"), (["{}/good.xyz", "--up", "0,0,0"], "--up"),
         (["{}/good.xyz", "--method", "magic"], "magic"), (["{}/good.xyz", "--out", "{}/no/trees.json"], "does not exist"),
-        (["{}/good.xyz", "--out", "{}"], "is a folder"),
+        (["{}/good.xyz", "--out", "{}"], "is a folder"), (["{}/good.xyz", "--out", "{}/" + "x" * 300], "too long"),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_line_and_exit_2(
