@@ -35,5 +35,5 @@ def test_a_rendered_mission_docks_although_the_refiner_is_killed_on_the_way(tmp_
     assert abs(dock["true_heading_deg"]) <= 3.0
     assert abs(dock["distance_m"] - dock["true_distance_m"]) < 0.05
     assert values["truth"]["false"] == 0
-    # nothing was lost on the way but what died with the refiner
-    assert sum(values["dropped"].values()) < 50, values["dropped"]
+    # nothing was lost on the way but the dead refiner's answers
+    assert set(values["dropped"]) <= {"navigator", "simulator"}, values["dropped"]
