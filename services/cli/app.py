@@ -66,7 +66,8 @@ def invoke(arguments: list[str]) -> int:
     except _USAGE_ERROR as error:
         context = getattr(error, "ctx", None)
         where = f" (see `{context.command_path} --help`)" if context else ""
-        return _tell(f"{error.format_message()}{where}", EXIT_INPUT)
+        said = error.format_message()  # empty where the help was printed instead
+        return _tell(f"{said}{where}", EXIT_INPUT) if said.strip() else EXIT_INPUT
     except typer.Exit as stop:
         return stop.exit_code
     except (KeyboardInterrupt, typer.Abort):

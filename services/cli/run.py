@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from services.cli.options import AsJson, ConfigFile, Port, Settings, loaded
+from services.common.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -70,12 +71,21 @@ def run(
 def expected_frames(tree: TreedockConfig) -> int | None:
     """Return how many frames the source will give, None when nobody knows.
 
-    A recording is opened for it, which also finds its faults half a minute before the camera service would.
+    A recording is opened for it, which also finds its faults half a minute before the camera service would; so is the
+    name of a scene looked up.
 
     Raises:
-        InputError: a recording that cannot be used.
+        InputError: a source or scene that cannot be used.
     """
-    if tree.camera.source in {"sim", "realsense"}:
+    if tree.camera.source == "sim":
+        from services.simulator.catalogue import scene_for
+
+        scene_for(tree.simulator.scene, tree.simulator.seed)
+        return None
+    if tree.camera.source == "realsense":
+        from services.camera.sources.realsense import require_library
+
+        require_library()
         return None
     from services.camera.sources import open_source
 
@@ -88,7 +98,6 @@ def with_port(tree: TreedockConfig, *, fixed: bool) -> TreedockConfig:
     Raises:
         InputError: the fixed port is taken.
     """
-    from services.common.errors import InputError
     from services.common.session import free_port, port_is_free
 
     host, port = tree.router.host, tree.router.port
@@ -120,11 +129,13 @@ class Run:
         self._console = console
         self._as_json = as_json
         self._keep_logs = logs is not None
-        if logs is not None:
-            logs.mkdir(parents=True, exist_ok=True)
         self._folder = logs or Path(tempfile.mkdtemp(prefix="treedock-run-"))
         self._config_file = self._folder / "config.json"
-        self._config_file.write_text(tree.model_dump_json(indent=1))
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._config_file.write_text(tree.model_dump_json(indent=1))
+        except OSError as error:
+            raise InputError(f"--logs {self._folder}: cannot be written: {error.strerror}") from None
 
     def to_the_end(self) -> int:
         """Run until the source has ended or the user stops it; print the summary and return the exit code.
@@ -133,7 +144,6 @@ class Run:
             InputError: a service refused its configuration or input; GoalNotReachedError: one could not be kept alive.
         """
         from services.cli.supervisor import Supervisor
-        from services.common.errors import InputError
         from services.common.logging import set_up
         from services.common.stop import StopSignal
 
@@ -222,7 +232,7 @@ class Run:
                     return
 
     def _raise_if_given_up(self, supervisor: Supervisor) -> None:
-        from services.common.errors import GoalNotReachedError, InputError
+        from services.common.errors import GoalNotReachedError
 
         child = supervisor.given_up
         if child is None:

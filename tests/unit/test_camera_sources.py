@@ -61,6 +61,13 @@ def test_accelerometer_mean_is_of_this_frames_interval(tmp_path: Path) -> None:
     assert frames[1].accel_camera == pytest.approx((-2.5, 0.0, 0.0))
 
 
+def test_a_dead_accelerometer_tells_nothing(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "s", 2, accelerometer=True)
+    path = folder / "accelerometer.txt"
+    path.write_text("".join(f"{line.split()[0]} 0 0 0\n" for line in path.read_text().splitlines()))
+    assert [item.accel_camera for item in TumSource(folder, CONFIG) if isinstance(item, RgbdFrame)] == [None, None]
+
+
 def test_groundtruth_is_never_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = write_tum(tmp_path / "s", 3)
     (folder / "groundtruth.txt").write_text("nonsense\n")

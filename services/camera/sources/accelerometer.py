@@ -17,6 +17,8 @@ from services.camera.sources.text import read_rows, stamp_ns_of
 from services.common.errors import InputError
 
 SIGNS_CAMERA_FROM_FILE = np.array([-1.0, -1.0, 1.0])
+_LEAST_MPS2 = 1.0
+"""Below: falling freely, or a dead sensor that sends zeros. Neither tells where up is."""
 _LONGEST_WINDOW_NS = 200_000_000
 """Older samples do not describe this frame, even when frames were missed before it."""
 
@@ -52,4 +54,6 @@ class Accelerometer:
         if a == b:
             return None
         x, y, z = (float(v) for v in (self._sums[b] - self._sums[a]) / (b - a))
+        if x * x + y * y + z * z < _LEAST_MPS2**2:
+            return None
         return x, y, z

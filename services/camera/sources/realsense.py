@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Iterator
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,16 @@ _WAIT_MS = 200
 """A frame takes 33 ms; a service that waits longer than this could not stop quickly."""
 
 
+def require_library() -> None:
+    """Check that pyrealsense2 is installed.
+
+    Raises:
+        InputError: it is not.
+    """
+    if find_spec("pyrealsense2") is None:
+        raise InputError("camera source realsense: pyrealsense2 is missing; install treedock[realsense]")
+
+
 class RealsenseSource:
     """Live frames, depth registered to colour; it ends only when the device is gone."""
 
@@ -30,10 +41,9 @@ class RealsenseSource:
     expected: int | None = None
 
     def __init__(self, config: CameraConfig) -> None:
-        try:
-            import pyrealsense2 as rs
-        except ImportError:
-            raise InputError("camera source realsense: pyrealsense2 is missing; install treedock[realsense]") from None
+        require_library()
+        import pyrealsense2 as rs
+
         self._rs: Any = rs
         self._config = config
         settings = rs.config()
