@@ -25,7 +25,7 @@ _PRIOR_SLOPE = 0.02
 _PRIOR_TAPER = 0.008
 """Standard deviation of the taper about its mean, metres of radius per metre of height."""
 _MEAN_TAPER = -0.006
-_MOST = (1500, 5000)
+_MOST = (600, 2500)
 """Points that the first and the second turn of a fit use at most."""
 _CORRELATED = 25.0
 """Neighbouring points share fixed-pattern noise and bark: so many of them count as one in the covariance."""
@@ -160,7 +160,7 @@ def _fit(
         for a in range(6):
             x[a] += limit * step[a]
         x[4] = max(x[4], 0.008)
-        if size < 2e-5:
+        if size < 5e-5:
             break
     return scale
 
@@ -271,6 +271,24 @@ def fit_cylinder(voxels: Voxels, stack: Stack, config: DetectorConfig) -> Cylind
     return _measured(P, U, G, x, scale, at, slope, normal, config)
 
 
+def _girth_correction(P: Floats, x: Floats) -> float:
+    """Return what to add to the radius so that every direction counts alike, not every point.
+
+    Trunks are not round and scans are denser on one side; a tape goes round all sides. Mean over 36 sectors of the
+    median residual; sectors with fewer than 8 points count as the fitted circle.
+    """
+    z = P[:, 2]
+    dx, dy = P[:, 0] - x[0] - x[2] * z, P[:, 1] - x[1] - x[3] * z
+    e = np.hypot(dx, dy) - (x[4] + x[5] * z)
+    sector = ((np.arctan2(dy, dx) + np.pi) / (2.0 * np.pi) * BINS).astype(np.int64) % BINS
+    near = np.abs(e) < min(0.08, 0.5 * x[4])
+    total = 0.0
+    for b in range(BINS):
+        own = e[near & (sector == b)]
+        total += float(np.median(own)) if len(own) >= 8 else 0.0
+    return total / BINS
+
+
 def _measured(
     P: Floats, U: Floats, G: Floats, x: Floats, scale: float, at: Floats, slope: Floats, normal: Floats,
     config: DetectorConfig,
@@ -279,6 +297,8 @@ def _measured(
     z_low = float(P[:, 2].min())
     bands = np.zeros(int((P[:, 2].max() - z_low) / 0.1) + 1, dtype=np.int64)
     _assess(P, U, G, x, scale, config.range_noise_per_m, config.surface_noise_m, on, counts, bands, z_low)
+    if not U.any():
+        x[4] += _girth_correction(P, x)
     held = np.flatnonzero(bands >= 3)
     if len(held) == 0:
         return None

@@ -152,7 +152,7 @@ def _plane_at(
     nx, ny = valid.shape
     A, y = np.zeros((3, 3)), np.zeros(3)
     row = np.array([1.0, 0.0, 0.0])
-    for iteration in range(5):
+    for iteration in range(4):
         A[:] = 0.0
         y[:] = 0.0
         n = 0
@@ -204,7 +204,9 @@ def _drop_above_wide_plane(cell_points: Floats, valid: NDArray[np.bool_], x0: fl
 
 
 @njit(cache=True, nogil=True)
-def _planes(cell_points: Floats, valid: NDArray[np.bool_], x0: float, y0: float, cell: float, planes: Floats) -> None:
+def _planes(
+    cell_points: Floats, valid: NDArray[np.bool_], counts: Floats, x0: float, y0: float, cell: float, planes: Floats
+) -> None:
     nx, ny = valid.shape
     whole = np.zeros(3)
     lowest = 1e30
@@ -217,8 +219,9 @@ def _planes(cell_points: Floats, valid: NDArray[np.bool_], x0: float, y0: float,
             xc = x0 + (a + 0.5) * cell
             yc = y0 + (b + 0.5) * cell
             found = False
+            near = counts[max(0, a - 1) : a + 2, max(0, b - 1) : b + 2].sum() > 0.0
             half = 2
-            while not found and half <= 16:
+            while near and not found and half <= 16:
                 found = _plane_at(cell_points, valid, a, b, half, xc, yc, whole)
                 half *= 2
             if found:
@@ -325,7 +328,7 @@ def find_ground(points_m: NDArray[np.floating], frame: Upright, cell_m: float) -
     _drop_hanging(cell_points, valid, cell)
     _drop_above_wide_plane(cell_points, valid, x0, y0, cell)
     planes = np.zeros((nx, ny, 3))
-    _planes(cell_points, valid, x0, y0, cell, planes)
+    _planes(cell_points, valid, counts, x0, y0, cell, planes)
     step = max(1, len(points_m) // 200_000)
     low, mid = _evidence(points_m, frame.R, frame.shift, x0, y0, cell, planes, step)
     if low > 1.5 * mid and low >= 50:

@@ -7,6 +7,9 @@ from numba import njit
 
 from services.detector.model import Floats, Ints
 
+_GOOD = 0.7
+"""A circle with this share of all points (truncated quadratic count) needs no rival."""
+
 
 @njit(cache=True, nogil=True)
 def _uniform(state: Ints) -> float:
@@ -33,7 +36,7 @@ def _circumcircle(P: Floats, i: int, j: int, k: int, out: Floats) -> bool:
 def _score(P: Floats, U: Floats, S: Floats, left: Ints, n: int, c: Floats) -> float:
     """Return a truncated quadratic count of the points on the visible side, less half of those inside the circle."""
     score = 0.0
-    step = max(1, n // 150)
+    step = max(1, n // 100)
     for q in range(0, n, step):
         i = left[q]
         dx, dy = P[i, 0] - c[0], P[i, 1] - c[1]
@@ -65,7 +68,7 @@ def best_seed(
     """Return the best score of circles through three near points; writes the circle to ``best``."""
     top = 0.0
     c = np.empty(3)
-    for _ in range(trials):
+    for trial in range(trials):
         i = left[min(n - 1, int(_uniform(state) * n))]
         j, k = -1, -1
         for _ in range(10):
@@ -84,4 +87,6 @@ def best_seed(
         if score > top:
             top = score
             best[0], best[1], best[2] = c[0], c[1], c[2]
+            if trial > 8 and top > _GOOD * n:
+                break
     return top
