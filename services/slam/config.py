@@ -26,14 +26,12 @@ class SlamConfig(BaseModel):
     """Standard deviation of the inverse of that distance, 1/m."""
     baseline_m: float = Field(default=0.08, gt=0)
     """Virtual stereo baseline: depth enters as the disparity ``fx * baseline / z``, whose noise is constant."""
-    disparity_sigma_px: float = Field(default=0.6, gt=0)
+    disparity_sigma_px: float = Field(default=0.3, gt=0)
     """Noise of that disparity."""
     min_inliers: int = Field(default=25, ge=6)
     """Fewer matches of the map than this: lost."""
-    keyframe_ratio: float = Field(default=0.75, gt=0, le=1)
-    """A new keyframe when fewer than this share of the reference keyframe's points is tracked."""
-    keyframe_interval_max: int = Field(default=20, ge=1)
-    """A new keyframe after so many frames in any case when the view has changed."""
+    keyframe_ratio: float = Field(default=0.8, gt=0, le=1)
+    """A new keyframe when the inliers fall below this share of the most since the last one."""
     close_tracked_min: int = Field(default=100, ge=0)
     close_untracked_max: int = Field(default=70, ge=0)
     """A keyframe at once when fewer close points are tracked and more are not."""
@@ -41,4 +39,3 @@ class SlamConfig(BaseModel):
     """Keyframes that a local bundle adjustment moves."""
     loop_closing: bool = True
     relocalise: bool = True
-    accel_window_s: float = Field(default=0.5, ge=0)

@@ -133,6 +133,13 @@ class Mapping:
         atlas.points.pos[ids] = problem.X
         drop_outliers(atlas.points, kf, ids, slots, problem.start, problem.pose, problem.use)
 
+    def turn(self, R: F64) -> None:
+        """Turn the whole map about its origin: ``R`` (3, 3) takes old map points to new ones."""
+        points, kf = self.atlas.points, self.atlas.keyframes
+        points.pos[:] = points.pos @ R.T
+        points.normal[:] = points.normal @ R.T
+        kf.R[:] = kf.R @ R.T
+
     def _cull_keyframes(self, k: int) -> None:
         atlas = self.atlas
         kf = atlas.keyframes

@@ -61,6 +61,7 @@ class Slam:
         self.reset_counter = 0
         self.graph_version = 0
         self.up_sigma_rad = gravity.SIGMA_UNKNOWN_RAD
+        self._level = gravity.Level()
         self._last: Tracked | None = None
         self._step = np.eye(4)
         """T_camera_lastcamera of the last two tracked frames: the constant velocity."""
@@ -92,7 +93,8 @@ class Slam:
             frame = self._relocalise(features)
         if frame is None:
             return self._lost(stamp_ns)
-        return self._accept(stamp_ns, frame)
+        levelled = self._level_map(stamp_ns, frame, accel_camera, attitude_up_camera)
+        return self._accept(stamp_ns, frame, levelled=levelled)
 
     def _initialise(self, stamp_ns: int, features: Features, accel: F64 | None, attitude: F64 | None) -> TrackResult:
         if np.count_nonzero(features.depth > 0.0) < _MIN_START_POINTS:
@@ -122,19 +124,39 @@ class Slam:
             return None
         return joined[0]
 
+    def _level_map(self, stamp_ns: int, frame: Tracked, accel: F64 | None, attitude: F64 | None) -> bool:
+        """Turn the map upright when gravity is known better; True when it was turned."""
+        if accel is None or attitude is not None or not np.isfinite(accel).all():
+            return False
+        found = self._level.add(stamp_ns, inverse(pose(frame.R, frame.t)), np.asarray(accel, dtype=float))
+        if found is None:
+            return False
+        up, self.up_sigma_rad = found
+        first = self.atlas.slots[0]
+        R = gravity.levelling(up, self.atlas.keyframes.R[first, 2])
+        self.mapping.turn(R)
+        self._level.turn(R)
+        for located in (self._last, frame):
+            if located is not None:
+                located.R = np.ascontiguousarray(located.R @ R.T)
+        if np.arccos(np.clip(up[2], -1.0, 1.0)) > _JUMP_RAD:
+            self._count_reset()
+        return True
+
     def _relocalise(self, features: Features) -> Tracked | None:
         """Return the frame located anywhere in the map; that is a jump, and told as one."""
         frame = self.loops.relocate(features)
         if frame is not None:
             self._last = None
             self._step = np.eye(4)
+            self._level.restart()
             self._count_reset()
         return frame
 
     def _count_reset(self) -> None:
         self.reset_counter = (self.reset_counter + 1) % 256
 
-    def _accept(self, stamp_ns: int, frame: Tracked) -> TrackResult:
+    def _accept(self, stamp_ns: int, frame: Tracked, *, levelled: bool = False) -> TrackResult:
         """Remember a frame that has its pose, and make a keyframe of it when the map needs one."""
         if self._last is not None:
             self._step = pose(frame.R, frame.t) @ inverse(pose(self._last.R, self._last.t))
@@ -142,6 +164,9 @@ class Slam:
         graph = None
         if self._needs_keyframe(frame):
             new, graph = self._make_keyframe(frame)
+        elif levelled:
+            self.graph_version += 1
+            graph = self._graph("full_ba")
         self._set_anchor(frame)
         self._last = frame
         self._log.stamp_ns.append(stamp_ns)
@@ -157,6 +182,7 @@ class Slam:
         if correction is not None:
             reason = "loop"
             if correction.jump_m > _JUMP_M or correction.jump_rad > _JUMP_RAD:
+                self._level.restart()
                 self._count_reset()
         kf = self.atlas.keyframes
         frame.R, frame.t = kf.R[k].copy(), kf.t[k].copy()
