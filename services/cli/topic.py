@@ -91,16 +91,14 @@ def _print_table(topics: tuple[Topic, ...], live: list[str]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(header_style="bold")
-    for column in ("topic", "from", "to", "Hz", "reach", "delivery", "message"):
-        table.add_column(column, justify="right" if column == "Hz" else "left")
+    table = Table(header_style="bold", box=None, pad_edge=False)
+    for column in ("topic", "from", "Hz", "reach"):
+        table.add_column(column, justify="right" if column == "Hz" else "left", no_wrap=True)
+    table.add_column("to")  # the one that may take several lines
     for topic in topics:
         producer = f"[green]{topic.producer}[/]" if topic.producer in live else topic.producer
-        rate = f"{topic.rate_hz:g}" if topic.rate_hz else "on change"
-        table.add_row(
-            topic.name, producer, ", ".join(topic.consumers), rate, topic.reach.value, topic.delivery.value,
-            getattr(topic.message, "SCHEMA", ""),
-        )  # fmt: skip
+        rate = f"{topic.rate_hz:g}" if topic.rate_hz else "-"
+        table.add_row(topic.name, producer, rate, topic.reach.value, ", ".join(topic.consumers))
     Console().print(table)
 
 

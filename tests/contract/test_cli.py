@@ -119,6 +119,13 @@ def test_topic_list_works_without_a_router() -> None:
     assert found["live"] == []
 
 
+def test_topic_list_fits_80_columns_and_cuts_no_name() -> None:
+    lines = treedock("topic", "list", "--port", "1").stdout.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert "…" not in "".join(lines)
+    assert {line.split()[0] for line in lines if line.strip()} >= {topic.name for topic in TOPICS}
+
+
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda t: t.name)
 def test_every_message_is_readable(topic: Topic) -> None:
     message = next(m for m in all_messages().values() if isinstance(m, topic.message))
