@@ -1,0 +1,91 @@
+"""slam's service on the in-memory bus: order of messages, bad frames, the message's fields."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from schemas.camera import Intrinsics, RgbdFrame
+from schemas.codec import Wire, decode, encode
+from schemas.slam import Graph, Keyframe, Pose
+from schemas.topics import CAMERA_RGBD, SLAM_GRAPH, SLAM_KEYFRAME, SLAM_POSE
+from services.camera.codecs import decode_depth
+from services.common.clock import SimulatedClock
+from services.common.config import TreedockConfig
+from services.common.memory import Hub, MemoryContext
+from services.slam.service import build
+from tests.unit.slam_room import INTRINSICS, look, turn_on_the_spot
+
+
+def frame(seq: int, intrinsics: Intrinsics = INTRINSICS) -> RgbdFrame:
+    grey, depth_m = look(turn_on_the_spot(12, 30.0)[min(seq, 11)])
+    raw = np.round(depth_m * intrinsics.depth_scale).astype(np.uint16)
+    return RgbdFrame(
+        stamp_ns=seq * 66_666_667, seq=seq, intrinsics=intrinsics, depth=raw.tobytes(),
+        colour=np.repeat(grey[:, :, None], 3, axis=2).tobytes(), accel_camera=(0.0, -9.81, 0.0),
+    )  # fmt: skip
+
+
+def started() -> tuple[Hub, MemoryContext, MemoryContext, list[Wire]]:
+    hub = Hub(TreedockConfig(), SimulatedClock())
+    context = hub.context("slam")
+    build(context)  # type: ignore[arg-type]  # the protocol's clock is writable, so it wants exactly Clock
+    said: list[Wire] = []
+    camera = hub.context("camera")
+    for topic in (SLAM_POSE, SLAM_KEYFRAME, SLAM_GRAPH):
+        camera.on(topic, said.append)
+    return hub, context, camera, said
+
+
+def test_keyframe_and_graph_come_before_the_pose_that_rests_on_them() -> None:
+    hub, _, camera, said = started()
+    camera.publish(CAMERA_RGBD, frame(0))
+    hub.run()
+    assert [type(m) for m in said] == [Keyframe, Graph, Pose]
+    assert all(decode(type(m), encode(m)) == m for m in said)
+    keyframe, pose = said[0], said[-1]
+    assert isinstance(keyframe, Keyframe)
+    assert isinstance(pose, Pose)
+    assert pose.keyframe_id == keyframe.keyframe_id
+    raw = decode_depth(keyframe.depth, "zstd", INTRINSICS.width, INTRINSICS.height)
+    assert raw.tobytes() == bytes(frame(0).depth)
+
+
+def test_every_frame_has_a_pose_and_silence_polishes_the_map() -> None:
+    hub, _, camera, said = started()
+    for seq in range(6):
+        hub.advance_to(seq * 66_666_667)
+        camera.publish(CAMERA_RGBD, frame(seq))
+        hub.run()
+    poses = [m for m in said if isinstance(m, Pose)]
+    assert [p.seq for p in poses] == list(range(6))
+    assert all(p.T_map_camera is not None and p.covariance is not None for p in poses)
+    camera.publish(CAMERA_RGBD, frame(11))
+    hub.run()
+    hub.advance_to(5_000_000_000)
+    graphs = [m for m in said if isinstance(m, Graph)]
+    assert [g.version for g in graphs] == sorted({g.version for g in graphs})
+
+
+def test_another_cameras_frame_is_dropped_counted_and_told() -> None:
+    hub, context, camera, said = started()
+    camera.publish(CAMERA_RGBD, frame(0))
+    hub.run()
+    before = len(said)
+    camera.publish(CAMERA_RGBD, frame(1, INTRINSICS.model_copy(update={"fx": 300.0})))
+    hub.run()
+    assert len(said) == before
+    assert context.health.counters["dropped_bad_frames"] == 1
+    assert "fx 300" in context.health.notes["camera/rgbd"]
+    camera.publish(CAMERA_RGBD, frame(2))
+    hub.run()
+    assert isinstance(said[-1], Pose)
+    assert not context.health.notes
+
+
+def test_a_frame_from_the_past_is_dropped() -> None:
+    hub, context, camera, said = started()
+    for seq in (3, 2):
+        camera.publish(CAMERA_RGBD, frame(seq))
+        hub.run()
+    assert sum(isinstance(m, Pose) for m in said) == 1
+    assert context.health.counters["dropped_bad_frames"] == 1
