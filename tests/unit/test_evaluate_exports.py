@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+import base64
 import csv
 import io
 import json
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
@@ -13,7 +15,7 @@ from services.common.errors import InputError
 from services.common.geometry import level_camera
 from services.evaluate import exports
 from services.evaluate.atomic import prepare, write_files
-from services.evaluate.report import top_view_svg
+from services.evaluate.top_view import top_view_svg
 
 TREE = Tree(
     id=3, x_m=1.23456789, y_m=-2.0, z_m=-1.5, axis=(0.0, 0.6, 0.8), radius_m=0.1, radius_height_m=1.3,
@@ -99,10 +101,15 @@ def test_results_go_into_the_present_folder_too(tmp_path: Path, monkeypatch: pyt
 def test_the_folder_above_out_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Path] = []
     mkdir = Path.mkdir
-    monkeypatch.setattr(Path, "mkdir", lambda self, *a, **k: (made.append(self), mkdir(self, *a, **k))[1])
+
+    def noted(self: Path, mode: int = 0o777, parents: bool = False, exist_ok: bool = False) -> None:
+        made.append(self)
+        mkdir(self, mode, parents, exist_ok)
+
     (tmp_path / "out").mkdir()
+    monkeypatch.setattr(Path, "mkdir", noted)
     write_files(tmp_path / "out", {"a": b"1"})
-    assert made[1].parent == tmp_path / "out", "it may be closed to this user, or another disk"
+    assert [path.parent for path in made] == [tmp_path / "out"], "above may be closed to this user, or another disk"
 
 
 def test_an_out_with_an_impossible_name_is_refused(tmp_path: Path) -> None:
@@ -120,5 +127,23 @@ def test_an_out_that_is_a_file_is_refused(tmp_path: Path) -> None:
 
 def test_the_top_view_shows_each_tree_and_survives_none() -> None:
     poses = [(i, level_camera((0.1 * i, 0.0, 0.0), 0.0)) for i in range(5)]
-    assert top_view_svg([TREE], poses).count("<circle") == 2
-    assert "<svg" in top_view_svg([], [])
+    points = np.random.default_rng(1).uniform(-2.0, 2.0, (1000, 3)).astype(np.float32)
+    one, none = (top_view_svg(trees, poses, points) for trees in ([TREE], []))
+    assert one.count("<circle") == none.count("<circle") + 1
+    for svg in (one, none, top_view_svg([], []), top_view_svg([TREE] * 3, [], np.empty((0, 3), np.float32))):
+        ET.fromstring(svg)
+        width, height = (float(v) for v in svg.split('viewBox="')[1].split('"')[0].split()[2:])
+        assert height <= width, "it fits a screen, whatever the path"
+    assert "data:image/png" in one
+
+
+def test_the_raster_is_a_png_with_the_points_where_they_are() -> None:
+    import cv2
+
+    poses = [(0, level_camera((0.0, 0.0, 0.0), 0.0)), (1, level_camera((4.0, 0.0, 0.0), 0.0))]
+    svg = top_view_svg([], poses, np.array([[4.5, 0.5, 1.0]], np.float32))
+    data = base64.b64decode(svg.split("base64,")[1].split('"')[0])
+    image = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED))
+    ((row, column),) = np.argwhere(image[..., -1] > 0)
+    assert row < 0.1 * image.shape[0], "x is up the page"
+    assert 0.4 * image.shape[1] < column < 0.5 * image.shape[1], "y is to the left"
