@@ -60,8 +60,12 @@ class Context(Protocol):
     uav: str
     service: str
     config: TreedockConfig
-    clock: Clock
     health: HealthBook
+
+    @property
+    def clock(self) -> Clock:
+        """The one clock of the service."""
+        ...
 
     def on(self, topic: Topic, handler: Callable[[M], None], leaf: str | None = None) -> None:
         """Call ``handler(message)`` for each sample of ``topic`` (LATEST: only the newest), from the work loop."""

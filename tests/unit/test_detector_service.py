@@ -36,7 +36,7 @@ def _moved(submap: Submap, T: Floats) -> Submap:
 class _System:
     def __init__(self) -> None:
         self.hub = Hub(TreedockConfig())
-        self.detector: DetectorService = build(self.hub.context("detector"))  # type: ignore[arg-type]
+        self.detector: DetectorService = build(self.hub.context("detector"))
         self.lists: list[TreeList] = []
         self.mapper = self.hub.context("mapper")
         self.whole: list[Submap] = []

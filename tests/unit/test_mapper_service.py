@@ -39,7 +39,7 @@ def _graph(version: int, poses: dict[int, np.ndarray], map_id: str = "m1") -> Gr
 class _Listener:
     def __init__(self) -> None:
         self.hub = Hub(TreedockConfig())
-        self.mapper: MapperService = build(self.hub.context("mapper"))  # type: ignore[arg-type]
+        self.mapper: MapperService = build(self.hub.context("mapper"))
         self.heard: list[Submap] = []
         self.slam = self.hub.context("slam")
         self.hub.context("detector").on(MAP_CLOUD, self.heard.append)

@@ -28,7 +28,7 @@ def frame(seq: int, intrinsics: Intrinsics = INTRINSICS) -> RgbdFrame:
 def started() -> tuple[Hub, MemoryContext, MemoryContext, list[Wire]]:
     hub = Hub(TreedockConfig(), SimulatedClock())
     context = hub.context("slam")
-    build(context)  # type: ignore[arg-type]  # the protocol's clock is writable, so it wants exactly Clock
+    build(context)  # the protocol's clock is writable, so it wants exactly Clock
     said: list[Wire] = []
     camera = hub.context("camera")
     for topic in (SLAM_POSE, SLAM_KEYFRAME, SLAM_GRAPH):
