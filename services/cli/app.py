@@ -72,15 +72,24 @@ def invoke(arguments: list[str]) -> int:
         return stop.exit_code
     except (KeyboardInterrupt, typer.Abort):
         return EXIT_INTERRUPTED
-    except BrokenPipeError:  # the reader of our output went away: `treedock topic echo ... | head`
-        sys.stderr.close()
-        return EXIT_DONE
+    except BrokenPipeError:
+        return _reader_left()
+    except SystemExit as stop:
+        if isinstance(stop.__context__, BrokenPipeError):  # typer makes exit code 1 of it
+            return _reader_left()
+        raise
     except Exception:  # noqa: BLE001 - the one place where a bug ends
         import traceback
 
         traceback.print_exc()
         return _tell("this is a bug in treedock: please report it with the lines above", EXIT_BUG)
     return result if isinstance(result, int) else EXIT_DONE
+
+
+def _reader_left() -> int:
+    """End quietly when the reader of our output went away: ``treedock topic echo ... | head``."""
+    sys.stderr.close()
+    return EXIT_DONE
 
 
 def _tell(text: str, code: int) -> int:

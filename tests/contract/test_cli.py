@@ -104,6 +104,19 @@ def test_a_command_without_its_word_shows_the_help_alone(arguments: tuple[str, .
     assert result.stderr == ""
 
 
+@pytest.mark.parametrize("arguments", [("--help",), ("topic", "list", "--port", "1"), ("config",)])
+def test_a_reader_that_goes_away_is_no_fault(arguments: tuple[str, ...]) -> None:
+    command = [sys.executable, "-u", "-m", "services.cli.app", *arguments]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    said = process.stderr.read()
+    process.stderr.close()
+    assert process.wait(timeout=60) == 0, said
+    assert "Traceback" not in said
+
+
 def test_config_prints_what_is_in_force() -> None:
     result = treedock("config", "--set", "slam.features=801")
     assert tomllib.loads(result.stdout)["slam"]["features"] == 801
