@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import builtins
+import dataclasses
 import json
 import os
 from collections.abc import Callable
@@ -223,6 +224,20 @@ def test_an_mcap_file_gives_back_its_frames(tmp_path: Path) -> None:
     wanted[(wanted < 1500) | (wanted > 35000)] = 0
     assert np.array_equal(decode_depth_raw(frames[2]), wanted)
     assert frames[2].colour_encoding == "bgr8"
+
+
+def test_a_recording_carries_its_own_intrinsics(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", 1)
+    with pytest.raises(InputError, match="carries its own intrinsics"):
+        McapSource(path, CONFIG.model_copy(update={"camera_file": "other.json"}))
+
+
+def test_a_recorded_dead_accelerometer_tells_nothing(tmp_path: Path) -> None:
+    with FrameWriter(tmp_path / "a.mcap") as writer:
+        for force in ((0.0, 0.0, 0.0), (0.0, -9.8, 0.0)):
+            writer.add(dataclasses.replace(frame(), accel_camera=force))
+    items = list(McapSource(tmp_path / "a.mcap", CONFIG))
+    assert [item.accel_camera for item in items if isinstance(item, RgbdFrame)] == [None, (0.0, -9.8, 0.0)]
 
 
 def test_lossless_colour_is_a_setting(tmp_path: Path) -> None:

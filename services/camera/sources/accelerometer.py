@@ -23,6 +23,11 @@ _LONGEST_WINDOW_NS = 200_000_000
 """Older samples do not describe this frame, even when frames were missed before it."""
 
 
+def telling(force_mps2: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+    """Return a specific force that tells where up is, None for one that does not."""
+    return force_mps2 if force_mps2 and sum(v * v for v in force_mps2) >= _LEAST_MPS2**2 else None
+
+
 class Accelerometer:
     """Samples of one recording, in the camera's optical frame."""
 
@@ -54,6 +59,4 @@ class Accelerometer:
         if a == b:
             return None
         x, y, z = (float(v) for v in (self._sums[b] - self._sums[a]) / (b - a))
-        if x * x + y * y + z * z < _LEAST_MPS2**2:
-            return None
-        return x, y, z
+        return telling((x, y, z))

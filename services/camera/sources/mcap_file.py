@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ from schemas.topics import CAMERA_COMPRESSED, CAMERA_RGBD, Topic
 from services.camera.codecs import FrameError, raw, recode
 from services.camera.config import CameraConfig
 from services.camera.ranging import limit_frame
+from services.camera.sources.accelerometer import telling
 from services.camera.sources.base import BadFrame
 from services.common.errors import InputError
 
@@ -80,6 +82,8 @@ class McapSource:
     def __init__(self, path: Path, config: CameraConfig) -> None:
         if not path.is_file():
             raise InputError(f"{path}: no such file")
+        if config.camera_file:
+            raise InputError(f"{config.camera_file}: not used: {path} carries its own intrinsics; leave --camera out")
         self.name = str(path)
         self._path = path
         self._config = config
@@ -102,6 +106,7 @@ class McapSource:
     def _frame(self, log_time_ns: int, data: bytes, number: int) -> RgbdFrame | BadFrame:
         try:
             frame = raw(RgbdFrame.from_bytes(data))
+            frame = dataclasses.replace(frame, accel_camera=telling(frame.accel_camera))
             return limit_frame(frame, self._config.min_range_m, self._config.max_range_m)
         except (DecodeError, FrameError) as error:
             return BadFrame(log_time_ns, f"{self._path}: message {number}: {error}")
