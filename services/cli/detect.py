@@ -115,19 +115,20 @@ def _write(out: Path, data: bytes) -> None:
     """Write the whole file or nothing; a device or a pipe (/dev/null, /dev/stdout) is written to, never replaced."""
     from services.common.errors import InputError
 
-    if out.exists() and not out.is_file():
-        out.write_bytes(data)
-        return
-    out = out.resolve()
-    partial = out.with_name(f".{os.getpid()}.partial")
+    out = out.resolve() if out.is_file() or not out.exists() else out
+    device = out.exists() and not out.is_file()
+    partial = out if device else out.with_name(f".{os.getpid()}.partial")
     try:
         with partial.open("wb") as stream:
             stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        partial.replace(out)
+            if not device:
+                stream.flush()
+                os.fsync(stream.fileno())
+        if not device:
+            partial.replace(out)
     except OSError as error:
-        partial.unlink(missing_ok=True)
+        if not device:
+            partial.unlink(missing_ok=True)
         raise InputError(f"--out {out}: cannot be written: {error.strerror}") from error
 
 

@@ -107,6 +107,7 @@ def test_no_trees_is_a_result(tmp_path: Path) -> None:
         (["{}/good.xyz", "--up", "0,0"], "--up"), (["{}/good.xyz", "--up", "0,0,0"], "--up"),
         (["{}/good.xyz", "--method", "magic"], "magic"), (["{}/good.xyz", "--out", "{}/no/trees.json"], "does not exist"),
         (["{}/good.xyz", "--out", "{}"], "is a folder"), (["{}/good.xyz", "--out", "{}/" + "x" * 300], "too long"),
+        (["{}/good.xyz", "--out", "/dev/full"], "/dev/full: cannot be written: No space left"),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_line_and_exit_2(
