@@ -16,10 +16,19 @@ SIGMA_ACCEL_RAD = math.radians(3.0)
 SIGMA_ATTITUDE_RAD = math.radians(0.5)
 SIGMA_UNKNOWN_RAD = math.radians(10.0)
 """The first camera taken as level."""
+_LEAST_NORM = 0.5
+"""Of a measured up or specific force (1 or 9.81 at rest): below it there is no sensor, or free fall."""
 _LEVEL_AT_S = (2.0, 5.0, 12.0)
 _LEVEL_SIGMA_RAD = (math.radians(2.0), math.radians(2.0), math.radians(2.0))
 """After so long the vertical is corrected, and is then good to this: the accelerometer's own bias and mounting (3 to 4 deg
 on the Kinect of the recordings, against their motion capture; 0.5 deg in simulation)."""
+
+
+def direction(vector: F64 | None) -> F64 | None:
+    """Return a measured vector (3,) if it has a direction at all; a dead sensor's zeros and NaN give None."""
+    if vector is None or not np.isfinite(vector).all() or float(np.linalg.norm(vector)) < _LEAST_NORM:
+        return None
+    return np.asarray(vector, dtype=float)
 
 
 def first_pose(up_camera: F64 | None) -> F64:

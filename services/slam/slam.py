@@ -85,6 +85,7 @@ class Slam:
         ``accel_camera`` (3,) m/s^2 in the camera's frame (at rest up times 9.81), ``attitude_up_camera`` (3,) up in the
         camera's frame as the autopilot tells it.
         """
+        accel_camera, attitude_up_camera = gravity.direction(accel_camera), gravity.direction(attitude_up_camera)
         features = self._extractor.extract(grey, depth_m)
         if self.graph_version == 0:
             return self._initialise(stamp_ns, features, accel_camera, attitude_up_camera)
@@ -126,7 +127,7 @@ class Slam:
 
     def _level_map(self, stamp_ns: int, frame: Tracked, accel: F64 | None, attitude: F64 | None) -> bool:
         """Turn the map upright when gravity is known better; True when it was turned."""
-        if accel is None or attitude is not None or not np.isfinite(accel).all():
+        if accel is None or attitude is not None:
             return False
         found = self._level.add(stamp_ns, inverse(pose(frame.R, frame.t)), np.asarray(accel, dtype=float))
         if found is None:

@@ -173,3 +173,11 @@ def test_training_is_deterministic_and_complete() -> None:
     a, b = (vocabulary.train(images, 3, 2, 9) for _ in range(2))
     np.testing.assert_array_equal(a.centre, b.centre)
     assert set(a.words(images[0])) <= set(range(9))
+
+
+@pytest.mark.parametrize("dead", [np.zeros(3), np.full(3, np.nan), np.array([0.0, np.inf, 0.0])])
+def test_a_dead_accelerometer_is_no_accelerometer(dead: F64) -> None:
+    assert gravity.direction(dead) is None
+    slam, results = run([np.eye(4)] * 2, accel=dead)
+    assert results[-1].status == "tracking"
+    assert slam.up_sigma_rad == gravity.SIGMA_UNKNOWN_RAD
