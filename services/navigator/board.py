@@ -142,6 +142,14 @@ class Board:
         places = [(axis_at(t, z), t) for t in self.trees if t.id != self.target_id]
         return [Disc(float(p[0]), float(p[1]), t.radius_m + keep_out_m) for p, t in places]
 
+    @property
+    def fence_disc(self) -> Disc | None:
+        """The geofence from above."""
+        fence = self.trajectory.fence
+        if fence is None:
+            return None
+        return Disc(float(fence.centre_m[0]), float(fence.centre_m[1]), fence.radius_m)
+
     def to_axis(self) -> tuple[float, float] | None:
         """Return believed distance (m) to the target's axis and its bearing (rad, positive left), or None."""
         t, here = self.target, self.here

@@ -71,8 +71,9 @@ class FailsafeConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     pose_silent_s: float = Field(default=0.4, gt=0.0)
-    pose_hold_s: float = Field(default=4.0, gt=0.0)
-    """Shorter than the 5 s for which PX4 drifts unnoticed without vision."""
+    pose_hold_s: float = Field(default=3.0, gt=0.0)
+    """Shorter than the 5 s for which PX4 drifts unnoticed without vision. With EKF2_NOAID_TOUT at 1 s, which preflight
+    asks for, PX4 lands by its own failsafe before: 1.2 s after our hold."""
     pose_jump_m: float = Field(default=0.4, gt=0.0)
     pose_jump_rad: float = Field(default=math.radians(15.0), gt=0.0)
     correction_hold_m: float = Field(default=1.0, gt=0.0)

@@ -15,14 +15,18 @@ import numpy as np
 from services.common.geometry import Matrix
 
 _CELL_M = 0.15
-_MARGIN_M = 2.0
+_MARGINS_M = (2.0, 6.0)
+"""How far the search reaches beyond start and goal; further only when the near one finds no way."""
 _MAX_CELLS = 40_000
 _AZIMUTHS = 36
 
 
 @dataclass(frozen=True, slots=True)
 class Disc:
-    """A trunk as an obstacle: centre x, y and the radius that the aircraft's centre keeps out of."""
+    """A trunk as an obstacle: centre x, y and the radius that the aircraft's centre keeps out of.
+
+    The geofence is one that it keeps within.
+    """
 
     x_m: float
     y_m: float
@@ -66,19 +70,31 @@ def standoff(axis_m: Matrix, from_m: Matrix, distance_m: float, discs: Sequence[
     return best[1]
 
 
-def plan(start_m: Matrix, goal_m: Matrix, discs: Sequence[Disc]) -> list[Matrix] | None:
+def plan(start_m: Matrix, goal_m: Matrix, discs: Sequence[Disc], within: Disc | None = None) -> list[Matrix] | None:
     """Return the corner points (2,) after ``start_m`` to ``goal_m``, or None when there is no way.
 
     A circle that holds the start or the goal shrinks until it does not: from there only outward, never deeper.
+    No corner lies outside ``within``, the geofence's circle.
     """
     discs = [_shrunk(d, start_m, goal_m) for d in discs]
     if line_clearance_m(start_m, goal_m, discs) >= 0.0:
         return [goal_m]
-    low = np.minimum(start_m, goal_m) - _MARGIN_M
-    shape = tuple(int(n) for n in np.ceil((np.maximum(start_m, goal_m) + _MARGIN_M - low) / _CELL_M) + 1)
+    for margin_m in _MARGINS_M:
+        way = _detour(start_m, goal_m, discs, within, margin_m)
+        if way is not None:
+            return way
+    return None
+
+
+def _detour(
+    start_m: Matrix, goal_m: Matrix, discs: Sequence[Disc], within: Disc | None, margin_m: float
+) -> list[Matrix] | None:
+    """Return the corners of the shortest way on a grid that reaches ``margin_m`` beyond start and goal."""
+    low = np.minimum(start_m, goal_m) - margin_m
+    shape = tuple(int(n) for n in np.ceil((np.maximum(start_m, goal_m) + margin_m - low) / _CELL_M) + 1)
     if shape[0] * shape[1] > _MAX_CELLS:
         return None
-    cells = _search(_blocked(low, shape, discs), _cell(start_m, low), _cell(goal_m, low))
+    cells = _search(_blocked(low, shape, discs, within), _cell(start_m, low), _cell(goal_m, low))
     if cells is None:
         return None
     points = [low + np.array(c) * _CELL_M for c in cells[1:-1]] + [goal_m]
@@ -95,10 +111,12 @@ def _cell(p: Matrix, low: Matrix) -> tuple[int, int]:
     return int(i), int(j)
 
 
-def _blocked(low: Matrix, shape: tuple[int, ...], discs: Sequence[Disc]) -> Matrix:
+def _blocked(low: Matrix, shape: tuple[int, ...], discs: Sequence[Disc], within: Disc | None) -> Matrix:
     x = low[0] + np.arange(shape[0])[:, None] * _CELL_M
     y = low[1] + np.arange(shape[1])[None, :] * _CELL_M
     blocked = np.zeros(shape, dtype=bool)
+    if within is not None:
+        blocked |= np.hypot(x - within.x_m, y - within.y_m) > within.keep_out_m
     for d in discs:
         blocked |= np.hypot(x - d.x_m, y - d.y_m) < d.keep_out_m
     return blocked

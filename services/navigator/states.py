@@ -269,7 +269,7 @@ def _way(b: Board, start: Matrix, goal: Matrix) -> list[Matrix] | None:
     while b.corners and float(np.linalg.norm(b.corners[0] - start)) < _CORNER_M:
         b.corners = b.corners[1:]
     if b.planned_ns < 0 or (b.now_ns - b.planned_ns) / 1e9 > _REPLAN_S:
-        corners = plan(start, goal, b.discs(b.config.safety_radius_m))
+        corners = plan(start, goal, b.discs(b.config.safety_radius_m), b.fence_disc)
         if corners is None:
             return None
         b.corners, b.planned_ns = corners[:-1], b.now_ns

@@ -57,15 +57,30 @@ def test_the_pilot_takes_over_in_the_approach() -> None:
 
 
 def test_slam_lost_for_long_lands() -> None:
+    """EKF2_NOAID_TOUT is 1 s: PX4 lands by its own failsafe before our hold has run out, and is not fought."""
     flight = _flying("approach")
     flight.chain.slam_lost = True
     _ticks(flight, 0.5)
     assert flight.state == "hold"
-    # EKF2_NOAID_TOUT is 1 s: PX4 lands by its own failsafe before our hold has run out
-    assert flight.run((), 60.0) in ("landed", "released")
+    held_s = flight.elapsed_s
+    assert flight.run((), 60.0) == "released"
+    assert flight.elapsed_s - held_s < 1.5
     _ticks(flight, 20.0)
     assert not flight.px4.armed
     assert flight.px4.on_ground
+    assert flight.touches == 0
+
+
+def test_slam_lost_for_long_lands_by_our_order_where_px4_does_not() -> None:
+    flight = _flying("approach")
+    flight.px4.vehicle.params.set("EKF2_NOAID_TOUT", 5_000_000)  # PX4's default: drifts for 5 s
+    flight.chain.slam_lost = True
+    assert flight.run(("hold",), 1.0) == "hold"
+    held_s = flight.elapsed_s
+    assert flight.run(("landing",), 10.0) == "landing", flight.mission.reason
+    assert flight.elapsed_s - held_s == pytest.approx(3.0, abs=0.2)
+    assert flight.run(("landed",), 60.0) == "landed"
+    assert not flight.px4.armed
     assert flight.touches == 0
 
 

@@ -175,6 +175,17 @@ def test_the_straight_line_is_taken_when_free_and_left_when_not() -> None:
     assert plan(start, goal, ring) is None
 
 
+def test_the_way_around_a_long_wall_is_found_but_not_outside_the_fence() -> None:
+    """A wall that reaches beyond the near grid: its end is 3.2 m to the side (bench missions, seed 2015)."""
+    start, goal = np.array([0.0, 0.0]), np.array([0.0, 4.0])
+    wall = [Disc(float(x), 2.0, 1.1) for x in np.arange(-8.0, 3.0, 1.0)]
+    way = plan(start, goal, wall)
+    assert way is not None
+    assert max(float(corner[0]) for corner in way) > 3.0
+    assert plan(start, goal, wall, Disc(0.0, 0.0, 5.0)) is not None
+    assert plan(start, goal, wall, Disc(0.0, 0.0, 3.0)) is None
+
+
 def test_the_place_to_dock_at_keeps_clear_of_the_neighbour() -> None:
     axis, here = np.array([3.0, 0.0]), np.array([0.0, 0.0])
     assert standoff(axis, here, 0.95, []) == pytest.approx((2.05, 0.0))
