@@ -154,8 +154,7 @@ class Mission:
         if self.state == "idle" and self.since_ns == 0:
             self.since_ns = inputs.now_ns
         self.board.observe(inputs)
-        if self.board.step_kind in (Step.FIRST, Step.RELOCATED, Step.JUMP) and self.board.here is not None:
-            self.board.trajectory.reset(self.board.here.position_m, self.board.here.yaw_rad)
+        self._place()
         self._adopt(inputs.now_ns)
         self.fault = self.watch.check(self.board, self.state, self._resume)
         self._answer(inputs.now_ns)
@@ -166,6 +165,17 @@ class Mission:
         failsafe = self.fault.name if self.fault is not None else ""
         telling = Telling(self.state, self.previous, self.since_ns, self.reason, self.mission_id, self._seq, failsafe)
         return Outputs(telling.guidance(self.board, intent), telling.state_message(self.board), events)
+
+    def _place(self) -> None:
+        """Put the setpoint where the aircraft is when its pose is new or has jumped; until then there is none.
+
+        A pose may be new and already too old to trust (a restart on a busy machine): then the next one counts.
+        """
+        here, trajectory = self.board.here, self.board.trajectory
+        if self.board.step_kind in (Step.FIRST, Step.RELOCATED, Step.JUMP):
+            trajectory.placed = False
+        if here is not None and not trajectory.placed:
+            trajectory.reset(here.position_m, here.yaw_rad)
 
     def _adopt(self, now_ns: int) -> None:
         """Take over an aircraft that flies under our setpoints when we were started: hold, then land."""

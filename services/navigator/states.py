@@ -257,11 +257,12 @@ def _yaw_to_axis(b: Board) -> float:
 
 
 def _docking_place(b: Board, from_m: Matrix) -> Matrix | None:
-    """Return x, y of the place in front of the target that keeps clear of the other trunks, or None."""
+    """Return x, y of the place in front of the target that keeps clear of the other trunks, inside the fence, or None."""
     assert b.axis_m is not None
     place = standoff(b.axis_m, from_m, b.config.dock.aim_m, b.discs(b.config.safety_radius_m))
-    body = b.discs(b.config.aircraft_radius_m + 0.1)
-    return place if clearance_m(place, body) >= 0.0 else None
+    body, fence = b.discs(b.config.aircraft_radius_m + 0.1), b.fence_disc
+    outside = fence is not None and clearance_m(place, [fence]) > 0.0
+    return place if not outside and clearance_m(place, body) >= 0.0 else None
 
 
 def _way(b: Board, start: Matrix, goal: Matrix) -> list[Matrix] | None:

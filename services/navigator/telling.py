@@ -25,10 +25,13 @@ class Telling:
     failsafe: str
 
     def guidance(self, b: Board, intent: Intent) -> Guidance:
-        """Return the command with its magnitude and the setpoint that carries it out."""
+        """Return the command with its magnitude and the setpoint that carries it out.
+
+        Without a pose there is no setpoint: the bridge then holds by itself.
+        """
         t, last = b.trajectory, b.track.latest
         setpoint = None
-        if last is not None:
+        if last is not None and t.placed:
             setpoint = Setpoint(
                 position_m=_vec(t.position_m), yaw_rad=wrap_angle(t.yaw_rad), velocity_m_s=_vec(t.velocity_m_s),
                 yaw_rate_rad_s=float(t.yaw_rate_rad_s),

@@ -62,6 +62,8 @@ class Trajectory:
     def __init__(self, limits: MotionConfig) -> None:
         self.limits = limits
         self.fence: Fence | None = None
+        self.placed = False
+        """Whether the position below was ever taken from the aircraft's own: before that it must not be flown to."""
         self.position_m: Matrix = np.zeros(3)
         self.velocity_m_s: Matrix = np.zeros(3)
         self.accel_m_s2: Matrix = np.zeros(3)
@@ -71,6 +73,7 @@ class Trajectory:
     def reset(self, position_m: Matrix, yaw_rad: float) -> None:
         """Stand still at a place; ``yaw_rad`` keeps the count of turns nearest to the present one."""
         self.position_m = np.array(position_m, dtype=float)
+        self.placed = True
         self.yaw_rad += wrap_angle(yaw_rad - self.yaw_rad)
         self.freeze()
 

@@ -53,6 +53,8 @@ class World:
     shift_yaw_rad: float = 0.0
     target_visible: bool = True
     refiner_alive: bool = True
+    target_error_m: Matrix = field(default_factory=lambda: np.zeros(2))
+    """How far off the refiner has the target's axis."""
     dead: set[str] = field(default_factory=set)
     battery: float | None = 0.9
     station: bool = False
@@ -156,12 +158,14 @@ class World:
         wanted = self.mission.board.target_id
         t = next((t for t in self.trees if t.id == wanted), None)
         bearing = distance = None
+        axis = np.zeros(2)
         if t is not None:
-            offset = np.array([t.x_m, t.y_m]) - self.position_m[:2]
+            axis = np.array([t.x_m, t.y_m]) + self.target_error_m
+            offset = axis - self.position_m[:2]
             distance = float(np.linalg.norm(offset))
             bearing = wrap_angle(float(np.arctan2(offset[1], offset[0])) - self.yaw_rad)
         seen = t is not None and bearing is not None and abs(bearing) < 0.5 and self.target_visible
-        place = None if t is None else self.believed(np.array([t.x_m, t.y_m, 0.0]))
+        place = None if t is None else self.believed(np.array([*axis, 0.0]))
         return Target(
             stamp_ns=self.now_ns, seq=self._steps, map_id=self.map_id,
             status="tracking" if seen else "lost" if t else "none", tree_id=wanted, measured=seen,

@@ -62,6 +62,15 @@ def test_a_trunk_in_front_is_flown_around_and_hides_nothing_forever() -> None:
     assert "hold" not in _course(world)
 
 
+def test_a_tree_whose_docking_place_is_outside_the_fence_is_left() -> None:
+    config = NavigatorConfig()
+    config = config.model_copy(update={"motion": config.motion.model_copy(update={"fence_radius_m": 4.0})})
+    world = World(config, trees=[tree(1, 5.5, 0.0)])
+    world.start()
+    assert world.run("landed") == "landed"
+    assert any(e.reason == "no clear way to tree 1" for e in world.events)
+
+
 def test_a_tree_that_cannot_be_reached_is_given_up() -> None:
     ring = [
         tree(10 + i, 4.0 + 1.1 * np.cos(a), 1.1 * np.sin(a), 0.25, suitable=False)

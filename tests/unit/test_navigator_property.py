@@ -29,10 +29,12 @@ _EPS = 1e-6
 _FORESTS = (
     (tree(1, 4.0, 1.0), tree(2, -3.0, 2.0)),
     (tree(1, 2.5, 0.0), tree(2, 2.6, 0.55), tree(3, 0.0, -3.0)),
-    (tree(1, 5.8, 3.0), tree(2, 5.0, -4.6)),  # docking there is at the fence
+    (tree(1, 6.2, 3.0), tree(2, 5.0, -4.6)),  # docking there is at the fence
+    (tree(1, 6.6, 3.0),),  # docking there would be outside
     (tree(1, 5.0, 3.0, 0.3, suitable=False),),
     (),
 )
+_AT_THE_FENCE = 2
 
 
 @functools.cache
@@ -52,10 +54,18 @@ class Flights(RuleBasedStateMachine):
     @initialize(
         layout=st.integers(0, len(_FORESTS) - 1),
         state=st.sampled_from(["idle", "take_off", "scan", "select", "face", "approach", "approach", "dock", "undock"]),
+        first=st.sampled_from(["", "", "slam lost", "target off"]),
     )
-    def begin(self, layout: int, state: str) -> None:
+    def begin(self, layout: int, state: str, first: str) -> None:
+        if first == "target off":
+            layout, state = _AT_THE_FENCE, "dock"
         self.world = copy.deepcopy(_snapshot(layout, state))
         self.orders = int(state != "idle")
+        if first == "slam lost":
+            self.slam("lost")
+        elif first == "target off":
+            self.refiner_errs(0.4, 0.0)  # where docking would then be is outside the fence
+            self._step(6.0)
 
     def _step(self, seconds: float) -> None:
         for _ in range(round(seconds / STEP_S)):
@@ -76,11 +86,11 @@ class Flights(RuleBasedStateMachine):
         if not g.engage:
             return
         assert world.state not in ("idle", "preflight", "released", "landed", "failed")
-        fence = world.mission.board.trajectory.fence
-        if fence is not None and not g.land and world.state != "hold":
+        if not g.land and world.state != "hold":
             # the fence is where the map had it: a correction moves setpoint and home alike
             home = world.mission.board.home_m
             assert home is not None
+            assert world.mission.board.trajectory.fence is not None, "flying without a fence"
             away = np.array(s.position_m) - home
             assert np.hypot(away[0], away[1]) <= limits.fence_radius_m + 0.05
             assert -0.5 <= away[2] <= limits.fence_height_m + 0.05
@@ -130,6 +140,16 @@ class Flights(RuleBasedStateMachine):
     @rule(visible=st.booleans(), alive=st.booleans())
     def target(self, visible: bool, alive: bool) -> None:
         self.world.target_visible, self.world.refiner_alive = visible, alive
+        self._step(0.2)
+
+    @rule(outward_m=st.floats(-0.55, 0.55), aside_m=st.floats(-0.3, 0.3))
+    def refiner_errs(self, outward_m: float, aside_m: float) -> None:
+        """The refiner takes the trunk to be somewhere else: away from the start, say."""
+        tree_id = self.world.mission.board.target_id
+        t = next((t for t in self.world.trees if t.id == tree_id), None)
+        if t is not None:
+            out = np.array([t.x_m, t.y_m]) / np.hypot(t.x_m, t.y_m)
+            self.world.target_error_m = outward_m * out + aside_m * np.array([-out[1], out[0]])
         self._step(0.2)
 
     @rule(service=st.sampled_from(["camera", "slam", "mapper", "detector", "refiner"]), dead=st.booleans())
@@ -197,5 +217,5 @@ class Flights(RuleBasedStateMachine):
 
 TestFlights = Flights.TestCase
 TestFlights.settings = settings(
-    max_examples=60, stateful_step_count=10, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True
+    max_examples=100, stateful_step_count=10, deadline=None, suppress_health_check=list(HealthCheck), derandomize=True
 )

@@ -44,6 +44,8 @@ class Bridge:
         self.engagement = Engagement(config)
         self.parameters = ParameterReader(config.vehicle)
         self.setpoints_sent = 0
+        self.setpoints_refused = 0
+        self._far = ""
         self._wrong = refusals({}, config.vehicle)
         self._corrections: dict[tuple[str, int], Correction] = {}
         """From the map as it was under (map_id, reset_counter) to the present one."""
@@ -126,7 +128,7 @@ class Bridge:
         e = self.engagement
         return self.telemetry.state(
             now_ns, self._seq, connected=self.vehicle(now_ns).heard, override=e.override, mission_id=e.mission_id,
-            note=e.note or self.refusal(),
+            note=self._far or e.note or self.refusal(),
         )  # fmt: skip
 
     def _is_due(self, what: str, now_ns: int, period_ns: int) -> bool:
@@ -173,6 +175,7 @@ class Bridge:
 
     def _guided(self, now_ns: int) -> tuple[Matrix, float, Matrix, float] | None:
         """Return position, yaw, velocity (body, map) and yaw rate of the guidance in the present map, or None."""
+        self._far = ""
         g = self.engagement.usable(now_ns)
         last = self.vision.track.latest
         if g is None or g.setpoint is None or last is None or g.stamp_ns <= self._moved_ns:
@@ -191,7 +194,18 @@ class Bridge:
             position, velocity = correction.point(position), correction.vector(velocity)
             yaw += correction.yaw_rad
         body, body_yaw, body_velocity = self.mount.body_setpoint(position, yaw, velocity, s.yaw_rate_rad_s)
+        if self._out_of_reach(body, now_ns):
+            return None
         return body, body_yaw, body_velocity, s.yaw_rate_rad_s
+
+    def _out_of_reach(self, body: Matrix, now_ns: int) -> bool:
+        """Whether a setpoint is too far away to be meant; counted, and told in the vehicle state."""
+        T = self.vision.body(now_ns)
+        away_m = 0.0 if T is None else float(np.linalg.norm(body - T[:3, 3]))
+        if away_m > self.config.setpoint_reach_m:
+            self.setpoints_refused += 1
+            self._far = f"holding: the navigator asks for a place {away_m:.1f} m away"
+        return bool(self._far)
 
     def _hold(self, now_ns: int) -> tuple[Matrix, float] | None:
         """Return where to stand: where the aircraft is when the hold begins, else the last setpoint sent."""

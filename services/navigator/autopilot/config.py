@@ -41,6 +41,8 @@ class AutopilotConfig(BaseModel):
     position_sigma_m: float = Field(default=0.01, gt=0.0)
     """Least standard deviations told with the vision pose."""
     angle_sigma_rad: float = Field(default=0.005, gt=0.0)
+    setpoint_reach_m: float = Field(default=2.0, gt=0.5)
+    """A setpoint farther than this from where the aircraft is belongs to no sane mission (its leash is 0.6 m): hold."""
     guidance_stale_s: float = Field(default=0.4, gt=0.0)
     guidance_land_s: float = Field(default=6.0, gt=0.0)
     """Without guidance for this long: land. Longer than a navigator takes to be started again."""

@@ -64,6 +64,7 @@ class Autopilot:
         book = self._context.health
         book.counters["odometry_sent"] = self.bridge.vision.sent
         book.counters["setpoints_sent"] = self.bridge.setpoints_sent
+        book.counters["setpoints_refused"] = self.bridge.setpoints_refused
         book.note("link", "" if state.connected else "no word from the autopilot: is it running, is the address right?")
         book.note("wire", getattr(self._link, "failed", ""))
 
