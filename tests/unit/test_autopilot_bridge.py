@@ -393,13 +393,13 @@ def test_without_fused_vision_nothing_is_engaged() -> None:
 def test_setpoint_carries_position_velocity_yaw_and_yaw_rate_in_ned() -> None:
     rig = Rig()
     rig.engage()
-    rig.setpoint = (np.array([1.0, 2.0, 1.5]), 0.5, np.array([0.1, 0.2, 0.0]), 0.3)
+    rig.setpoint = (np.array([1.0, 0.8, 1.5]), 0.5, np.array([0.1, 0.2, 0.0]), 0.3)
     m = rig.setpoints(0.5)[-1]
     assert m.coordinate_frame == mav.MAV_FRAME_LOCAL_NED
     assert m.type_mask == 448
     assert (m.vx, m.vy, m.vz) == pytest.approx((0.1, -0.2, 0.0))
     assert m.x == pytest.approx(1.0, abs=0.02)
-    assert m.y == pytest.approx(-2.0, abs=0.04)
+    assert m.y == pytest.approx(-0.8, abs=0.04)
     assert m.z == pytest.approx(-1.5)
     assert m.yaw == pytest.approx(-0.5, abs=0.06)
     assert m.yaw_rate == pytest.approx(-0.3)
@@ -467,3 +467,14 @@ def test_words_of_others_on_the_link_are_not_heard() -> None:
     rig.run(1.0)
     rig.bridge.handle(message, rig.now_ns)
     assert rig.bridge.telemetry.mode == "hold"
+
+
+def test_a_setpoint_far_from_the_aircraft_is_refused_and_told() -> None:
+    rig = Rig()
+    rig.engage()
+    rig.setpoint = (np.array([9.0, 0.0, 1.0]), 0.0, np.zeros(3), 0.0)
+    sent = rig.setpoints(0.5)[2:]
+    assert sent
+    assert max(abs(m.x) for m in sent) < 0.5
+    assert rig.bridge.setpoints_refused > 0
+    assert "the navigator asks for a place 9" in rig.bridge.state(rig.now_ns).note
