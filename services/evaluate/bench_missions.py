@@ -17,7 +17,10 @@ from services.evaluate.bench_catalogue import _append, _read_results
 from services.evaluate.flight import Flight, FlightCase, obstacle_case, random_case
 from services.navigator.config import NavigatorConfig
 
-_CODE = ("schemas", "services.navigator", "services.navigator.autopilot", "services.simulator.px4")
+_CODE = (
+    "schemas", "services.navigator", "services.navigator.autopilot", "services.simulator.px4",
+    "services.evaluate.flight", "services.evaluate.synthetic",
+)  # fmt: skip
 _COUNT, _QUICK_COUNT = 50, 10
 _LIMIT_S = 300.0
 
