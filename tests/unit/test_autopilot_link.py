@@ -59,6 +59,7 @@ def test_speaking_first_to_a_dead_port_is_no_error() -> None:
     for _ in range(3):
         link.send(mav.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
         time.sleep(0.01)
+        assert list(link.poll()) == []
     link.close()
 
 
