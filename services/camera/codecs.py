@@ -1,6 +1,7 @@
 """Image bytes to arrays and back. A damaged image gives one FrameError, never a half-grey picture.
 
-OpenCV fills what is missing of a cut JPEG or PNG with grey and prints to stderr; so the container is checked first.
+OpenCV fills what is missing of a cut JPEG or PNG with grey and prints to stderr; so the container is checked first:
+a PNG by its chunks and checksums, a JPEG by walking its data (``jpeg.py``).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.camera import ColourEncoding, DepthEncoding, RgbdFrame
+from services.camera.jpeg import jpeg_fault
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -35,7 +37,7 @@ def check_container(data: Bytes) -> None:
     """Check that a PNG or JPEG is whole.
 
     Raises:
-        FrameError: neither PNG nor JPEG, cut short, or (PNG) a chunk whose CRC is wrong.
+        FrameError: neither PNG nor JPEG, cut short, or damaged inside.
     """
     view = memoryview(data)
     if len(view) == 0:
@@ -48,6 +50,8 @@ def check_container(data: Bytes) -> None:
     if view[:3] == _JPEG_START:
         if not bytes(view[-64:]).rstrip(b"\0").endswith(_JPEG_END):
             raise FrameError(f"truncated JPEG: no end marker in {len(view)} bytes")
+        if fault := jpeg_fault(view):
+            raise FrameError(fault)
         return
     raise FrameError(f"neither PNG nor JPEG: it begins with {bytes(view[:4]).hex()}")
 
@@ -85,10 +89,19 @@ def decode_colour_image(data: Bytes, width: int, height: int) -> NDArray[np.uint
     Raises:
         FrameError: damaged, or of another size.
     """
+    if memoryview(data)[:8] == _PNG_MAGIC and _png_bits(data) == 16:
+        raise FrameError(
+            "colour image has 16 bits a pixel, expected 8: is it the depth image (colour and depth swapped)?"
+        )
     image = _decode_image(data, "IMREAD_COLOR")
     if image.shape != (height, width, 3) or image.dtype != np.uint8:
         raise FrameError(f"colour image is {image.shape[1]}x{image.shape[0]}, expected {width}x{height}")
     return image.astype(np.uint8, copy=False)
+
+
+def _png_bits(data: Bytes) -> int:
+    """Return the bits a sample of a PNG has (its IHDR chunk comes first), 0 when it is cut before that."""
+    return data[24] if len(data) > 24 else 0
 
 
 def decode_depth_image(data: Bytes, width: int, height: int) -> NDArray[np.uint16]:
@@ -102,7 +115,8 @@ def decode_depth_image(data: Bytes, width: int, height: int) -> NDArray[np.uint1
         raise FrameError(f"depth image is {image.shape[1]}x{image.shape[0]}, expected {width}x{height}")
     if image.ndim != 2 or image.dtype != np.uint16:
         channels = 1 if image.ndim == 2 else image.shape[2]
-        raise FrameError(f"depth image has {channels} channel(s) of {image.dtype}, expected one of uint16")
+        swapped = ": is it the colour image (colour and depth swapped)?" if channels >= 3 else ""
+        raise FrameError(f"depth image has {channels} channel(s) of {image.dtype}, expected one of uint16{swapped}")
     return image.astype(np.uint16, copy=False)
 
 

@@ -5,7 +5,14 @@ from __future__ import annotations
 import importlib
 import time
 
-PACKAGES = ("services.slam", "services.mapper", "services.detector", "services.detector.refine", "services.simulator")
+PACKAGES = (
+    "services.camera",
+    "services.slam",
+    "services.mapper",
+    "services.detector",
+    "services.detector.refine",
+    "services.simulator",
+)
 
 
 def warm() -> None:

@@ -19,6 +19,7 @@ from services.camera.codecs import (
     raw,
     recode,
 )
+from services.camera.jpeg import jpeg_fault
 from services.camera.ranging import limit_range
 from tests.camera_data import colour_image, depth_image, frame
 
@@ -66,6 +67,57 @@ def test_a_flipped_bit_in_a_png_is_refused() -> None:
     data[len(data) // 2] ^= 4
     with pytest.raises(FrameError, match="checksum"):
         decode_depth_image(bytes(data), 48, 32)
+
+
+JPEG_FLAVOURS = {
+    "plain": [], "restarts": [cv2.IMWRITE_JPEG_RST_INTERVAL, 3], "own tables": [cv2.IMWRITE_JPEG_OPTIMIZE, 1],
+    "full chroma": [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, 0x111111], "progressive": [cv2.IMWRITE_JPEG_PROGRESSIVE, 1],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("flavour", JPEG_FLAVOURS)
+@pytest.mark.parametrize("shape", [(32, 48, 3), (31, 43, 3), (5, 5, 3), (32, 48)])
+def test_a_whole_jpeg_is_accepted(flavour: str, shape: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(1)
+    for quality in (20, 90, 100):
+        image = rng.integers(0, 255, shape, dtype=np.uint8)
+        options = [cv2.IMWRITE_JPEG_QUALITY, quality, *JPEG_FLAVOURS[flavour]]
+        assert jpeg_fault(bytes(cv2.imencode(".jpg", image, options)[1])) == ""
+
+
+def _large_jpeg(options: list[int]) -> bytes:
+    rng = np.random.default_rng(2)
+    image = cv2.resize(rng.integers(0, 255, (60, 80, 3), dtype=np.uint8), (640, 480), interpolation=cv2.INTER_CUBIC)
+    return bytes(cv2.imencode(".jpg", image, options)[1])
+
+
+@pytest.mark.parametrize("kind", ["zeros", "noise", "ones", "cut out"])
+@pytest.mark.parametrize("flavour", ["plain", "restarts", "own tables", "full chroma"])
+def test_a_jpeg_damaged_in_its_middle_is_refused(flavour: str, kind: str) -> None:
+    data, rng = _large_jpeg(JPEG_FLAVOURS[flavour]), np.random.default_rng(3)
+    for start in np.linspace(0.1, 0.9, 9):
+        at = int(start * len(data))
+        damage = {"zeros": bytes(2000), "noise": rng.bytes(2000), "ones": b"\xff" * 2000, "cut out": b""}[kind]
+        with pytest.raises(FrameError, match="JPEG"):
+            decode_colour_image(data[:at] + damage + data[at + 2000 :], 640, 480)
+
+
+def test_a_restart_out_of_turn_is_refused() -> None:
+    data = _large_jpeg(JPEG_FLAVOURS["restarts"])
+    at = data.index(b"\xff\xd3")
+    with pytest.raises(FrameError, match="restart"):
+        decode_colour_image(data[:at] + b"\xff\xd4" + data[at + 2 :], 640, 480)
+
+
+def test_swapped_colour_and_depth_are_told() -> None:
+    with pytest.raises(FrameError, match="colour and depth swapped"):
+        decode_colour_image(encode_depth(depth_image(1), "png"), 48, 32)
+    with pytest.raises(FrameError, match="colour and depth swapped"):
+        decode_depth_image(encode_colour(colour_image(1), "jpeg"), 48, 32)
+    colour_png = bytes(cv2.imencode(".png", colour_image(1))[1])
+    assert np.array_equal(decode_colour_image(colour_png, 48, 32), colour_image(1))
+    with pytest.raises(FrameError, match=r"3 channel\(s\) of uint8"):
+        decode_depth_image(colour_png, 48, 32)
 
 
 def test_padding_after_a_jpeg_is_no_fault() -> None:
