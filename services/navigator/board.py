@@ -35,6 +35,8 @@ class Board:
     inputs: Inputs = field(default_factory=lambda: Inputs(0))
     step_kind: Step = Step.STALE
     """Of the pose taken at this step."""
+    began_ns: int = 0
+    """Time of the first step."""
     correction: Correction | None = None
     home_m: Matrix | None = None
     home_known: bool = True
@@ -85,6 +87,13 @@ class Board:
         """The last tracked pose while slam is trusted, else None."""
         fresh = self.inputs.age_s(self.inputs.pose) <= self.config.failsafe.pose_silent_s
         return self.track.latest if fresh and not self.track.lost else None
+
+    @property
+    def blind_s(self) -> float:
+        """Seconds since the last tracked pose came, or since we began to look for one."""
+        last = self.track.latest
+        since_ns = max(self.began_ns, 0 if last is None else last.received_ns)
+        return (self.now_ns - since_ns) / 1e9
 
     @property
     def vehicle(self) -> VehicleState | None:
@@ -163,6 +172,7 @@ class Board:
     # -- keeping it current -------------------------------------------------------------------------------------
     def observe(self, inputs: Inputs) -> None:
         """Take a step's inputs."""
+        self.began_ns = self.began_ns or inputs.now_ns
         if self.inputs.now_ns:
             self.dt_s = min(max((inputs.now_ns - self.inputs.now_ns) / 1e9, 0.0), 0.2)
         self.inputs, self.correction, self.step_kind = inputs, None, Step.STALE

@@ -71,9 +71,11 @@ class FailsafeConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     pose_silent_s: float = Field(default=0.4, gt=0.0)
+    pose_land_s: float = Field(default=0.9, gt=0.0)
+    """Without a pose for this long we land. PX4 gives up its position 1 s after the last vision (EKF2_NOAID_TOUT) and
+    0.2 s of its own delay; until then it still lands on our word, and lands better: on its position as long as it can."""
     pose_hold_s: float = Field(default=3.0, gt=0.0)
-    """Shorter than the 5 s for which PX4 drifts unnoticed without vision. With EKF2_NOAID_TOUT at 1 s, which preflight
-    asks for, PX4 lands by its own failsafe before: 1.2 s after our hold."""
+    """After a jump: in hold until the poses agree with each other again, or landing."""
     pose_jump_m: float = Field(default=0.4, gt=0.0)
     pose_jump_rad: float = Field(default=math.radians(15.0), gt=0.0)
     correction_hold_m: float = Field(default=1.0, gt=0.0)

@@ -138,12 +138,14 @@ def _vehicle_link(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
 def _slam(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
     f = b.config.failsafe
     del w, doing
-    age = b.inputs.age_s(b.inputs.pose)
+    age, blind_s = b.inputs.age_s(b.inputs.pose), b.blind_s
+    response: Response = "land" if blind_s > f.pose_land_s and not b.config.handheld else "hold"
     if age > f.pose_silent_s:
         name, word = _who_is_silent(b)
-        return Fault(name, "hold", f"{word}: no pose for {age:.1f} s", f.pose_hold_s, blind=True)
+        return Fault(name, response, f"{word}: no pose for {age:.1f} s", f.pose_hold_s, blind=True)
     if b.track.lost:
-        return Fault("slam lost", "hold", "slam lost its place", f.pose_hold_s, blind=True)
+        word = "slam lost its place" if response == "hold" else f"slam lost its place {blind_s:.1f} s ago: landing"
+        return Fault("slam lost", response, word, f.pose_hold_s, blind=True)
     return None
 
 

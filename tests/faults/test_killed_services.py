@@ -26,7 +26,7 @@ def test_slam_killed_holds_and_lands(tmp_path: Path) -> None:
         assert flown.until(lambda: flown.state == "hold", 30.0)
         assert (flown.states[-1].since_ns - killed_ns) * 1e-9 < 0.5 + _KILL_S
         assert flown.until(lambda: flown.guidance[-1].command == "stop", 5.0)
-        # PX4 itself leaves offboard about 1.2 s after our hold (EKF2_NOAID_TOUT), else we land after pose_hold_s
+        # we land after pose_land_s, before PX4 leaves offboard by itself (EKF2_NOAID_TOUT)
         assert flown.until(lambda: flown.state in {"landing", "released"}, 60.0)
         assert (flown.states[-1].since_ns - killed_ns) * 1e-9 < 6.0
         code, values, err = flown.result()
