@@ -68,6 +68,8 @@ class Topic:
     cache: int = 1
     """Samples that an advanced publisher keeps for late joiners."""
     recorded: bool = True
+    radio_hz: float = 0.0
+    """Behind a router's radio interface the key is thinned to this rate; 0: every sample passes."""
     description: str = ""
 
     @property
@@ -96,7 +98,7 @@ CAMERA_RGBD = Topic("camera/rgbd", RgbdFrame, "camera", ("slam", "refiner", "nav
 CAMERA_COMPRESSED = Topic("camera/rgbd_compressed", RgbdFrame, "camera", ("recorder",), 0, None, _A, _LATEST, "data_low",
                           description="the same as JPEG and PNG, sent only while somebody listens")  # fmt: skip
 SLAM_POSE = Topic("slam/pose", Pose, "slam", ("refiner", "navigator", "autopilot", "simulator", "station"), 15, 0.5, _R, _STREAM,
-                  "interactive_high", express=True, description="camera in map for each frame, with covariance")  # fmt: skip
+                  "interactive_high", radio_hz=5, express=True, description="camera in map for each frame, with covariance")  # fmt: skip
 SLAM_KEYFRAME = Topic("slam/keyframe", Keyframe, "slam", ("mapper",), 0, None, _A, _ADVANCED, "data", cache=64,
                       description="keyframe with compressed depth")  # fmt: skip
 SLAM_GRAPH = Topic("slam/graph", Graph, "slam", ("mapper",), 0, None, _A, _ADVANCED, "data_high",
@@ -106,13 +108,13 @@ MAP_CLOUD = Topic("map/cloud", Submap, "mapper", ("detector",), 0, None, _A, _ST
 TREES_LIST = Topic("trees/list", TreeList, "detector", ("refiner", "navigator", "station"), 0, None, _R, _ADVANCED, "data_high",
                    description="all trees known; a queryable answers with the latest")  # fmt: skip
 TREES_TARGET = Topic("trees/target", Target, "refiner", ("navigator", "simulator", "station"), 15, 0.5, _R, _STREAM,
-                     "interactive_high", express=True, description="the target trunk in the depth image")  # fmt: skip
+                     "interactive_high", radio_hz=5, express=True, description="the target trunk in the depth image")  # fmt: skip
 MISSION_STATE = Topic("mission/state", MissionState, "navigator", ("refiner", "autopilot", "station"), 5, 1.0, _R, _STREAM,
-                      "interactive_high", express=True, description="the mission's state, its reason, the target")  # fmt: skip
+                      "interactive_high", radio_hz=5, express=True, description="the mission's state, its reason, the target")  # fmt: skip
 MISSION_GUIDANCE = Topic("mission/guidance", Guidance, "navigator", ("autopilot", "simulator"), 20, 0.3, _A, _STREAM,
                          "interactive_high", express=True, description="one of eight commands with its setpoint")  # fmt: skip
 VEHICLE_STATE = Topic("vehicle/state", VehicleState, "autopilot", ("navigator", "slam", "simulator", "station"), 20, 0.5, _R, _STREAM,
-                      "interactive_high", express=True, description="mode, arming, attitude, battery")  # fmt: skip
+                      "interactive_high", radio_hz=5, express=True, description="mode, arming, attitude, battery")  # fmt: skip
 COMMAND = Topic("cmd/*", Command, "station", ("navigator",), 0, None, _R, _QUERY, "real_time", express=True,
                 description="start hold resume abort land choose next: the reply says accepted or why not")  # fmt: skip
 COMMAND_NONCE = Topic("nonce", NonceRequest, "station", ("navigator",), 0, None, _R, _QUERY, "real_time", express=True,

@@ -12,6 +12,7 @@ from typing import Any
 
 import typer
 
+from services.cli.certs import certs_app
 from services.cli.config_command import config
 from services.cli.run import run
 from services.cli.service_command import SERVICES, service_command
@@ -43,6 +44,7 @@ def make_app() -> typer.Typer:
             module = importlib.import_module(f"services.cli.{name}")
             app.command(name)(getattr(module, name))
     app.add_typer(topic_app, name="topic")
+    app.add_typer(certs_app, name="certs")
     app.command()(config)
     for name, about in SERVICES.items():
         app.command(name, help=about, rich_help_panel="Services (each its own process)")(service_command(name))

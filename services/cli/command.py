@@ -46,14 +46,14 @@ def _ask(name: CommandName, tree_id: int | None, timeout_s: float, tree: object)
     from services.common.config import TreedockConfig
     from services.common.context import HealthBook
     from services.common.errors import InputError
-    from services.common.session import opened_client
+    from services.common.session import opened_node
     from services.common.stop import StopSignal
     from services.navigator.client import send_command
 
     assert isinstance(tree, TreedockConfig)
     stop = StopSignal()
     stop.install()
-    with opened_client(tree.router.endpoint, lambda: stop.is_set, wait_s=0.0) as session:
+    with opened_node(tree, None, lambda: stop.is_set, wait_s=0.0) as session:
         bus = Bus(session, tree.uav, HealthBook())
         reply = send_command(bus, name, tree_id, f"cli.{os.getpid()}", timeout_s)
     if reply is None:

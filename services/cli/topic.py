@@ -49,12 +49,12 @@ def _joined(tree: TreedockConfig) -> Iterator[tuple[Bus, StopSignal]]:
     """Join the bus; the stop comes with Ctrl-C."""
     from services.common.bus import Bus
     from services.common.context import HealthBook
-    from services.common.session import opened_client
+    from services.common.session import opened_node
     from services.common.stop import StopSignal
 
     stop = StopSignal()
     stop.install()
-    with opened_client(tree.router.endpoint, lambda: stop.is_set, wait_s=0.0) as session:
+    with opened_node(tree, None, lambda: stop.is_set, wait_s=0.0) as session:
         bus = Bus(session, tree.uav, HealthBook())
         stop.when_set(bus.inbox.wake)
         yield bus, stop

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from services.camera.config import CameraConfig
 from services.cli.run_config import SupervisorConfig
@@ -15,6 +15,7 @@ from services.mapper.config import MapperConfig
 from services.navigator.autopilot.config import AutopilotConfig
 from services.navigator.config import NavigatorConfig
 from services.router.config import RouterConfig
+from services.security.config import SecurityConfig
 from services.simulator.config import SimulatorConfig
 from services.slam.config import SlamConfig
 
@@ -30,6 +31,7 @@ class TreedockConfig(BaseModel):
     """``sim``: time is what ``sim/clock`` says."""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     router: RouterConfig = RouterConfig()
+    security: SecurityConfig = SecurityConfig()
     supervisor: SupervisorConfig = SupervisorConfig()
     camera: CameraConfig = CameraConfig()
     slam: SlamConfig = SlamConfig()
@@ -39,6 +41,16 @@ class TreedockConfig(BaseModel):
     simulator: SimulatorConfig = SimulatorConfig()
     navigator: NavigatorConfig = Field(default_factory=NavigatorConfig)
     autopilot: AutopilotConfig = Field(default_factory=AutopilotConfig)
+
+    @model_validator(mode="after")
+    def _encrypted_or_plain(self) -> TreedockConfig:
+        """Certificates on a plain bus would guard nothing; an encrypted one without them admits nobody."""
+        encrypted = self.router.protocol != "tcp"
+        if encrypted and self.security.folder is None:
+            raise ValueError(f"router.protocol {self.router.protocol} needs security.folder (see `treedock certs`)")
+        if self.security.folder is not None and not encrypted:
+            raise ValueError("security.folder is set, but router.protocol is tcp: set it to tls, or to quic")
+        return self
 
 
 def load_config(file: Path | None = None) -> TreedockConfig:

@@ -27,7 +27,7 @@ from services.common.errors import InputError
 from services.common.health import HealthReporter, State
 from services.common.inbox import Inbox
 from services.common.logging import Throttle, set_up
-from services.common.session import opened_client, shared_memory_note
+from services.common.session import opened_node, shared_memory_note
 from services.common.stop import StopSignal
 
 LOG = logging.getLogger(__name__)
@@ -235,7 +235,7 @@ def run_service(
         stop.install()
     if note := shared_memory_note():
         LOG.warning(note)
-    open_session = session or (lambda s: opened_client(config.router.endpoint, lambda: s.is_set))
+    open_session = session or (lambda s: opened_node(config, name, lambda: s.is_set))
     try:
         with open_session(stop) as opened:
             clock: Clock = SimulatedClock() if config.clock == "sim" else WallClock()

@@ -9,12 +9,16 @@ import resource
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from typing import TYPE_CHECKING
 
 import zenoh
 
 from services.common.errors import InputError
+
+if TYPE_CHECKING:
+    from services.common.config import TreedockConfig
 
 LOG = logging.getLogger(__name__)
 
@@ -30,9 +34,15 @@ _TELL_AFTER_S = 2.0
 _ENOUGH_LOCKED_BYTES = 64 * 1024 * 1024
 
 
-def client_config(endpoint: str) -> zenoh.Config:
-    """Return the configuration of a node; ``endpoint`` is for example ``tcp/127.0.0.1:7447``."""
+def client_config(endpoint: str, secured: Mapping[str, object] | None = None) -> zenoh.Config:
+    """Return the configuration of a node.
+
+    Args:
+        endpoint: of the router, for example ``tcp/127.0.0.1:7447``.
+        secured: what ``services.security.transport.node_settings`` adds.
+    """
     return _config({
+        **(secured or {}),
         "mode": "client",
         "connect/endpoints": [endpoint],
         # lost routers are looked for at short, steady intervals: back within a second of its return
@@ -40,9 +50,9 @@ def client_config(endpoint: str) -> zenoh.Config:
     })  # fmt: skip
 
 
-def router_config(endpoint: str) -> zenoh.Config:
-    """Return the configuration of the router that listens on ``endpoint``."""
-    return _config({"mode": "router", "listen/endpoints": [endpoint]})
+def router_config(endpoint: str, secured: Mapping[str, object] | None = None) -> zenoh.Config:
+    """Return the configuration of the router that listens on ``endpoint``; ``secured`` of ``router_settings``."""
+    return _config({**(secured or {}), "mode": "router", "listen/endpoints": [endpoint]})
 
 
 def _config(values: dict[str, object]) -> zenoh.Config:
@@ -78,8 +88,27 @@ def opened(config: zenoh.Config) -> Iterator[zenoh.Session]:
             LOG.warning("the bus session did not close within %.1f s and is abandoned", _CLOSE_TIMEOUT_S)
 
 
+def opened_node(
+    config: TreedockConfig, service: str | None, stopped: Callable[[], bool], wait_s: float = float("inf")
+) -> AbstractContextManager[zenoh.Session]:
+    """Open the session of a service, or of a tool of the command line (``service`` None), as configured.
+
+    Raises:
+        InputError: a certificate is missing, or no router answers in ``wait_s`` seconds.
+    """
+    from services.security.transport import node_settings, pair_of
+
+    secured = node_settings(pair_of(config.security, config.uav, service))
+    return opened_client(config.router.endpoint, stopped, wait_s, secured)
+
+
 @contextmanager
-def opened_client(endpoint: str, stopped: Callable[[], bool], wait_s: float = float("inf")) -> Iterator[zenoh.Session]:
+def opened_client(
+    endpoint: str,
+    stopped: Callable[[], bool],
+    wait_s: float = float("inf"),
+    secured: Mapping[str, object] | None = None,
+) -> Iterator[zenoh.Session]:
     """Open a client session, waiting for the router up to ``wait_s`` seconds or until ``stopped()``.
 
     Raises:
@@ -96,7 +125,7 @@ def opened_client(endpoint: str, stopped: Callable[[], bool], wait_s: float = fl
         time.sleep(_RETRY_S)
     with ExitStack() as stack:
         try:
-            session = stack.enter_context(opened(client_config(endpoint)))
+            session = stack.enter_context(opened(client_config(endpoint, secured)))
         except zenoh.ZError as error:
             raise InputError(f"the router at {endpoint} refused the session: {error}") from error
         yield session

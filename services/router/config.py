@@ -11,12 +11,23 @@ class RouterConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     host: str = Field(default="127.0.0.1", min_length=1, pattern=r"^[A-Za-z0-9_.:\[\]-]+$")
-    """Where nodes connect; a router that other machines reach listens on 0.0.0.0 there."""
+    """Where nodes connect: the address of the router's machine."""
     port: int = Field(default=7447, ge=1, le=65535)
-    protocol: str = Field(default="tcp", pattern=r"^(tcp)$")
+    protocol: str = Field(default="tcp", pattern=r"^(tcp|tls|quic)$")
+    """tls and quic need certificates (section security); quic keeps a weak radio link's latency low."""
+    listen_host: str = Field(default="", pattern=r"^[A-Za-z0-9_.:\[\]-]*$")
+    """Where the router itself listens when that is not ``host``: 0.0.0.0 lets other machines in."""
 
     @property
     def endpoint(self) -> str:
         """Return the address in Zenoh's writing, for example ``tcp/127.0.0.1:7447``."""
-        host = f"[{self.host}]" if ":" in self.host and not self.host.startswith("[") else self.host
-        return f"{self.protocol}/{host}:{self.port}"
+        return self._at(self.host)
+
+    @property
+    def listen_endpoint(self) -> str:
+        """Return the address that the router listens on."""
+        return self._at(self.listen_host or self.host)
+
+    def _at(self, host: str) -> str:
+        written = f"[{host}]" if ":" in host and not host.startswith("[") else host
+        return f"{self.protocol}/{written}:{self.port}"

@@ -12,21 +12,24 @@ from services.common.errors import InputError
 from services.common.runtime import run_service
 from services.common.session import opened, port_is_free, router_config, split_endpoint
 from services.common.stop import StopSignal
+from services.security.transport import router_settings
 
 
 @contextmanager
-def listening(endpoint: str) -> Iterator[zenoh.Session]:
-    """Open the router's session on ``endpoint``.
+def listening(config: TreedockConfig) -> Iterator[zenoh.Session]:
+    """Open the router's session where the configuration says.
 
     Raises:
-        InputError: the port is taken or the address is not this machine's.
+        InputError: the port is taken, the address is not this machine's, or a certificate is missing.
     """
-    _, host, port = split_endpoint(endpoint)
-    if not port_is_free(host, port):
+    endpoint = config.router.listen_endpoint
+    secured = router_settings(config.security, config.uav)
+    protocol, host, port = split_endpoint(endpoint)
+    if protocol != "quic" and not port_is_free(host, port):
         raise InputError(f"port {port} on {host} is in use: stop what listens there, or choose another with --port")
     with ExitStack() as stack:
         try:
-            session = stack.enter_context(opened(router_config(endpoint)))
+            session = stack.enter_context(opened(router_config(endpoint, secured)))
         except zenoh.ZError as error:
             raise InputError(f"cannot listen on {endpoint}: {error}") from error
         yield session
@@ -38,5 +41,4 @@ def run(config: TreedockConfig, stop: StopSignal | None = None) -> int:
     Raises:
         InputError: the port is taken.
     """
-    endpoint = config.router.endpoint
-    return run_service("router", lambda _: None, config, stop, session=lambda _: listening(endpoint))
+    return run_service("router", lambda _: None, config, stop, session=lambda _: listening(config))

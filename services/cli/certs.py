@@ -1,0 +1,159 @@
+"""``treedock certs init|issue|renew|revoke|list|export``: the fleet's certificate authority."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from services.cli.options import AsJson
+
+if TYPE_CHECKING:
+    import datetime as dt
+    from collections.abc import Sequence
+
+    from services.security.authority import Authority
+
+certs_app = typer.Typer(
+    help="Certificates: one authority for the fleet, one certificate per service and station.", no_args_is_help=True
+)
+
+Folder = Annotated[Path, typer.Option("--folder", help="The authority's folder; keep it off the aircraft.")]
+Names = Annotated[
+    list[str], typer.Argument(help="Identities: uav1.slam, station.alice; uav1.all for a whole aircraft.")
+]
+Days = Annotated[int, typer.Option("--days", min=1, help="Validity of the certificates.")]
+Hosts = Annotated[
+    list[str] | None,
+    typer.Option("--host", help="Address under which nodes reach the router; may be given again."),
+]
+_FOLDER = Path("treedock-certs")
+_DAYS = 397
+
+
+@certs_app.command("init")
+def init(*, folder: Folder = _FOLDER) -> None:
+    """Make a new authority."""
+    from services.security.authority import Authority
+
+    Authority.create(folder, _now())
+    typer.echo(f"authority made in {folder}; {folder / 'ca.key'} is the fleet's secret: keep it, copy it nowhere")
+
+
+@certs_app.command("issue")
+def issue(names: Names, *, folder: Folder = _FOLDER, days: Days = _DAYS, host: Hosts = None) -> None:
+    """Issue certificates; one that an identity holds already is revoked."""
+    authority = _opened(folder)
+    for name in _expanded(names):
+        authority = _issue(authority, name, days, host)
+    typer.echo(_next_step(folder))
+
+
+@certs_app.command("renew")
+def renew(names: Names, *, folder: Folder = _FOLDER, days: Days = _DAYS, host: Hosts = None) -> None:
+    """Issue anew what was issued before, with the same addresses unless --host names others."""
+    from services.common.errors import InputError
+
+    authority = _opened(folder)
+    for name in _expanded(names, authority):
+        last = next((e for e in reversed(authority.register.entries) if e.identity == name), None)
+        if last is None:
+            raise InputError(f"{name}: nothing was issued yet; `treedock certs issue {name}` does it")
+        authority = _issue(authority, name, days, host or list(last.hosts))
+    typer.echo(_next_step(folder))
+
+
+@certs_app.command("revoke")
+def revoke(names: Names, *, folder: Folder = _FOLDER) -> None:
+    """Take all rights from identities; routers refuse them once they have the new list."""
+    from services.security.identity import Identity
+
+    authority = _opened(folder)
+    for name in _expanded(names, authority):
+        authority = authority.revoke(Identity.parse(name))
+        typer.echo(f"{name}: revoked")
+    typer.echo(f"copy {folder / 'identities.json'} to every router's machine and restart treedock-router there")
+
+
+@certs_app.command("list")
+def list_certificates(*, folder: Folder = _FOLDER, as_json: AsJson = False) -> None:
+    """Show what was issued, until when it holds, and what is revoked."""
+    from dataclasses import asdict
+
+    from services.security.register import Register
+
+    entries = Register.read(folder).entries
+    if as_json:
+        typer.echo(json.dumps([asdict(entry) for entry in entries]))
+        return
+    if not entries:
+        typer.echo("nothing was issued yet; `treedock certs issue uav1.all` does it for a whole aircraft")
+    width = max((len(entry.identity) for entry in entries), default=0)
+    now = _now().strftime("%Y-%m-%dT%H:%M:%SZ")
+    for entry in entries:
+        state = "revoked" if entry.revoked else "expired" if entry.valid_until < now else "valid"
+        where = f"  at {', '.join(entry.hosts)}" if entry.hosts else ""
+        typer.echo(f"{entry.identity:<{width}}  {state:<7}  until {entry.valid_until[:10]}{where}")
+
+
+@certs_app.command("export")
+def export(
+    names: Names,
+    to: Annotated[Path, typer.Option("--to", help="Folder for the machine, for example /etc/treedock/certs.")],
+    *,
+    folder: Folder = _FOLDER,
+) -> None:
+    """Copy what a machine with these nodes needs; never the authority's key."""
+    from services.security.identity import Identity
+
+    authority = _opened(folder)
+    files = authority.export([Identity.parse(name) for name in _expanded(names, authority)], to)
+    typer.echo(f"{len(files)} files in {to}; set security.folder to it and router.protocol to tls")
+
+
+def _opened(folder: Path) -> Authority:
+    from services.security.authority import Authority
+
+    return Authority.open(folder)
+
+
+def _issue(authority: Authority, name: str, days: int, hosts: Sequence[str] | None) -> Authority:
+    from services.security.identity import Identity
+
+    authority = authority.issue(Identity.parse(name), _now(), days, tuple(hosts or ("127.0.0.1", "localhost")))
+    typer.echo(f"{name}: valid until {authority.register.entries[-1].valid_until[:10]}")
+    return authority
+
+
+def _expanded(names: Sequence[str], authority: Authority | None = None) -> list[str]:
+    """Return the identities, with ``uav1.all`` replaced by the aircraft's services (those issued, when there is a list)."""
+    from services.cli.service_command import SERVICES
+    from services.security.identity import READER
+
+    found: list[str] = []
+    for name in names:
+        uav, dot, role = name.partition(".")
+        if not (dot and role == "all"):
+            found.append(name)
+        elif authority is None:
+            aboard = [service for service in SERVICES if service not in {"simulator", "station"}]
+            found += [f"{uav}.{service}" for service in (*aboard, READER)]
+        else:
+            held = {e.identity for e in authority.register.entries if not e.revoked}
+            found += sorted(identity for identity in held if identity.startswith(f"{uav}."))
+    return list(dict.fromkeys(found))
+
+
+def _next_step(folder: Path) -> str:
+    return (
+        f"in {folder}; `treedock certs export NAMES --to FOLDER` collects what a machine needs. A router knows new "
+        "certificates once it has the new identities.json and was restarted"
+    )
+
+
+def _now() -> dt.datetime:
+    import datetime as dt
+
+    return dt.datetime.now(dt.UTC)
