@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
@@ -39,7 +39,7 @@ def service_command(name: str) -> Callable[..., int]:
         sim_clock: Annotated[bool, typer.Option("--sim-clock", help="Live by the simulator's time.")] = False,
     ) -> int:
         if parent is not None:
-            _end_with(parent)
+            end_with(parent)
         more = {"clock": "sim"} if sim_clock else {}
         return run_by_name(name, config, settings, port, more)
 
@@ -47,7 +47,7 @@ def service_command(name: str) -> Callable[..., int]:
 
 
 def run_by_name(
-    name: str, config: Path | None, settings: list[str] | None, port: int | None, more: dict[str, str]
+    name: str, config: Path | None, settings: list[str] | None, port: int | None, more: Mapping[str, object]
 ) -> int:
     """Load the configuration, then the service's module, and run it; service processes end without further ado.
 
@@ -72,7 +72,7 @@ def run_by_name(
     return code
 
 
-def _end_with(parent: int) -> None:
+def end_with(parent: int) -> None:
     """Stop when the supervisor that started us ends, also when it already has."""
     import os
 

@@ -18,6 +18,7 @@ from services.router.config import RouterConfig
 from services.security.config import SecurityConfig
 from services.simulator.config import SimulatorConfig
 from services.slam.config import SlamConfig
+from services.station.config import StationConfig
 
 
 class TreedockConfig(BaseModel):
@@ -41,6 +42,7 @@ class TreedockConfig(BaseModel):
     simulator: SimulatorConfig = SimulatorConfig()
     navigator: NavigatorConfig = Field(default_factory=NavigatorConfig)
     autopilot: AutopilotConfig = Field(default_factory=AutopilotConfig)
+    station: StationConfig = StationConfig()
 
     @model_validator(mode="after")
     def _encrypted_or_plain(self) -> TreedockConfig:

@@ -1,0 +1,216 @@
+"""The station process: joins the bus of all aircraft, the decisions of ``brain`` and the page.
+
+The work loop decodes and decides; the web has its own thread; orders wait for their answers on threads of a small
+pool. What passes between them goes through the inbox, so that one thread alone touches the state.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import secrets
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import zenoh
+
+from schemas.command import CommandReply
+from schemas.envelope import Message
+from schemas.health import Health
+from schemas.topics import HEALTH, MISSION_STATE, PREFIX, SLAM_POSE, TREES_LIST, TREES_TARGET, VEHICLE_STATE, Topic
+from schemas.trees import TreeList
+from services.common.bus import Bus
+from services.common.health import HealthReporter
+from services.common.runtime import LiveContext
+from services.navigator.client import send_command
+from services.station.aircraft import Aircraft
+from services.station.brain import Brain, Outgoing
+from services.station.guard import Guard
+from services.station.preview import frame_of, jpeg_fault
+from services.station.requests import Request
+from services.station.server import WebServer, bound_socket
+from services.station.web import Site
+
+LOG = logging.getLogger(__name__)
+
+PREVIEW_KEY = "preview/image"
+_REQUEST_RING = 512
+_TOKEN_RING = 1_024
+_ORDERS_AT_ONCE = 8
+_TOPICS: dict[Topic, Callable[[Aircraft, Any], object]] = {
+    SLAM_POSE: Aircraft.on_pose, MISSION_STATE: Aircraft.on_mission, VEHICLE_STATE: Aircraft.on_vehicle,
+    TREES_TARGET: Aircraft.on_target, HEALTH: Aircraft.on_health,
+}  # fmt: skip
+
+
+class Station:
+    """The station over Zenoh."""
+
+    def __init__(self, context: LiveContext) -> None:
+        self._context = context
+        self.config = context.config.station
+        self._buses: dict[str, Bus] = {}
+        self._kept: list[object] = []
+        self._strangers: set[str] = set()
+        self._reporter = HealthReporter("station", context.health)
+        self._pool = ThreadPoolExecutor(_ORDERS_AT_ONCE, thread_name_prefix="order")
+        token = self._token()
+        self.site = Site(self.config, Guard(token, local=self.config.local), _Ears(self), {})
+        self.brain = Brain(self.config, self.site, self._send_order, time.time_ns)
+        self._server = WebServer(self.site, self.config, bound_socket(self.config.host, self.config.port))
+        self.address = self._address(token)
+
+    def _token(self) -> str:
+        """Return what browsers must know: none on this machine alone, nor where certificates are asked for."""
+        if self.config.local or self.config.tls_client_ca:
+            return self.config.token
+        return self.config.token or secrets.token_urlsafe(24)
+
+    def _address(self, token: str) -> str:
+        scheme = "https" if self.config.tls_certificate else "http"
+        host = f"[{self.config.host}]" if ":" in self.config.host else self.config.host
+        return f"{scheme}://{host}:{self._server.port}/" + (f"?token={token}" if token else "")
+
+    def register(self) -> None:
+        """Connect to the bus and open the page."""
+        c = self._context
+        self._told = c.inbox.mailbox(lambda call: call(), _REQUEST_RING)
+        tokens = c.inbox.mailbox(self._on_token, _TOKEN_RING)
+        direct: zenoh.handlers.Callback[zenoh.Sample]
+        direct = zenoh.handlers.Callback(lambda sample: c.inbox.put(tokens, sample), indirect=False)
+        session = c.bus.session
+        self._kept.append(session.liveliness().declare_subscriber(f"{PREFIX}/*/live/*", direct, history=True))
+        c.every_wall(1.0 / self.config.page_hz, lambda: self.brain.tell_state(time.monotonic()))
+        c.every_wall(1.0, self._each_second)
+        c.on_stop(self._stop)
+        self._server.start()
+        LOG.info("the page is at %s", self.address)
+
+    def call(self, action: Callable[[], None]) -> None:
+        """Have the work loop call ``action``; from any thread."""
+        self._context.inbox.put(self._told, action)
+
+    # -- aircraft
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        parts = str(sample.key_expr).split("/")
+        if len(parts) != 5 or parts[4] == "station":
+            return
+        uav, service = parts[2], parts[4]
+        alive = sample.kind == zenoh.SampleKind.PUT
+        if self._bus_of(uav) is not None:
+            self.brain.aircraft(uav).on_live(service[:64], alive=alive)
+
+    def _bus_of(self, uav: str) -> Bus | None:
+        """Return the bus of an aircraft, connected at its first sign of life; None when it is not ours."""
+        bus = self._buses.get(uav)
+        if bus is not None:
+            return bus
+        wanted = self.config.aircraft
+        if (wanted and uav not in wanted) or len(self._buses) >= self.config.max_aircraft or len(uav) > 64:
+            if len(self._strangers) < self.config.max_aircraft and uav not in self._strangers:
+                self._strangers.add(uav)
+                LOG.warning("aircraft %.64r is not shown: %s", uav, "not one of ours" if wanted else "too many")
+            self._context.health.count("strangers")
+            return None
+        bus = self._buses[uav] = Bus(self._context.bus.session, uav, self._context.health, self._context.inbox)
+        aircraft = self.brain.aircraft(uav)
+        for topic, take in _TOPICS.items():
+            bus.subscribe_keys(topic, functools.partial(self._on_message, aircraft, topic, take))
+        bus.subscribe(TREES_LIST, functools.partial(self._on_trees, aircraft))
+        self._subscribe_preview(bus, uav)
+        return bus
+
+    def _on_message(
+        self, aircraft: Aircraft, topic: Topic, take: Callable[[Aircraft, Any], object], key: str, message: Message
+    ) -> None:
+        if isinstance(message, Health) and (message.service == "station" or not key.endswith(f"/{message.service}")):
+            return
+        name = key.split("/", 3)[3]
+        aircraft.links.note(topic, name, time.monotonic(), getattr(message, "seq", None))
+        take(aircraft, message)
+        self._context.health.count("messages")
+
+    def _on_trees(self, aircraft: Aircraft, message: TreeList) -> None:
+        aircraft.links.note(TREES_LIST, TREES_LIST.name, time.monotonic(), None)
+        self._context.health.count("messages")
+        aircraft.on_trees(message)
+
+    def _subscribe_preview(self, bus: Bus, uav: str) -> None:
+        """Pass JPEGs on to the pages as they come; they are checked, never decoded here."""
+        box = self._context.inbox.mailbox(lambda sample: self._on_preview(uav, sample), 1)
+        direct: zenoh.handlers.Callback[zenoh.Sample]
+        direct = zenoh.handlers.Callback(lambda sample: self._context.inbox.put(box, sample), indirect=False)
+        self._kept.append(bus.session.declare_subscriber(f"{PREFIX}/{uav}/{PREVIEW_KEY}", direct))
+
+    def _on_preview(self, uav: str, sample: zenoh.Sample) -> None:
+        jpeg = sample.payload.to_bytes()
+        if fault := jpeg_fault(jpeg):
+            self._context.health.count("decode_errors.preview/image")
+            LOG.debug("refused a preview of %s: %s", uav, fault)
+            return
+        self.site.latest(f"preview/{uav}", frame_of(uav, jpeg))
+
+    # -- orders
+
+    def _send_order(self, order: Outgoing) -> None:
+        bus = self._buses[order.uav]
+
+        def ask() -> None:
+            reply: CommandReply | None = None
+            try:
+                reply = send_command(bus, order.name, order.tree_id, order.sender, self.config.command_timeout_s)
+            except zenoh.ZError as error:  # the session is closing or the router away
+                LOG.warning("order %s to %s failed: %s", order.name, order.uav, error)
+            self.call(lambda: self.brain.on_answer(order, reply))
+
+        self._pool.submit(ask)
+
+    # -- once a second, and the end
+
+    def _each_second(self) -> None:
+        self.brain.tell_trees()
+        for uav, bus in self._buses.items():
+            bus.count_overflows()
+            if uav != self._context.uav:  # the runtime tells that one itself
+                health = self._reporter.report(self._context.wall.now_ns(), bus.passed)
+                bus.publish(HEALTH, health, "station")
+        self._context.health.counters["pages"] = len(self.brain.sessions)
+        self._context.health.counters["refused_requests"] = self.brain.refused
+        self._context.health.counters["slow_pages"] = self.site.cut_off
+
+    def _stop(self) -> None:
+        self._server.stop()
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+class _Ears:
+    """Hands what pages say over to the work loop."""
+
+    def __init__(self, station: Station) -> None:
+        self._station = station
+
+    def opened(self, page: int, address: str) -> None:
+        """Hand over."""
+        self._station.call(lambda: self._station.brain.on_open(page, address))
+
+    def closed(self, page: int) -> None:
+        """Hand over."""
+        self._station.call(lambda: self._station.brain.on_close(page, time.monotonic()))
+
+    def said(self, page: int, request: Request) -> None:
+        """Hand over."""
+        self._station.call(lambda: self._station.brain.on_request(page, request, time.monotonic()))
+
+    def misspoke(self, page: int, why: str) -> None:
+        """Hand over."""
+        self._station.call(lambda: self._station.brain.refuse(page, why))
+
+
+def build(context: LiveContext) -> Station:
+    """Set the station up on a live context."""
+    station = Station(context)
+    station.register()
+    return station
