@@ -99,8 +99,9 @@ class Flown:
 class Conductor:
     """Orders the start when everything is ready, and follows the mission to its end. Called from one loop."""
 
-    def __init__(self, watch: Watch, within_s: float) -> None:
+    def __init__(self, watch: Watch, within_s: float, trees_wanted: int = 1) -> None:
         self._watch = watch
+        self._trees_wanted = trees_wanted
         self._within_s = within_s
         self.flown = Flown()
         self.vehicle: VehicleState | None = None
@@ -184,7 +185,7 @@ class Conductor:
         """Return how it ended, as plain values: the believed beside the true."""
         from services.evaluate.flown import mission_figures
 
-        values = mission_figures(self.flown)
+        values = mission_figures(self.flown, self._trees_wanted)
         if self.word:
             values["reason"] = self.word
         return values

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -17,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from services.cli import scratch
 from services.cli.options import AsJson, ConfigFile, Port, Settings, loaded
 from services.common.errors import InputError
 
@@ -32,6 +31,10 @@ if TYPE_CHECKING:
 _EXIT_NOT_REACHED = 3
 _ROUTER_WITHIN_S = 60.0
 _LOOK_S = 0.2
+_TREES_ANYWAY = 2
+"""A scene drawn at random holds at least one tree to dock at."""
+_SIMULATED_S_A_TREE, _WALL_S_A_TREE = 120.0, 400.0
+_TRIES = 4
 
 
 def run(
@@ -61,11 +64,32 @@ def run(
 
     flags = {"camera.source": source, "simulator.seed": seed, "simulator.scene": scene,
              "navigator.trees_wanted": trees, "navigator.handheld": True if handheld else None}  # fmt: skip
-    tree = loaded(config, settings, port, {k: v for k, v in flags.items() if v is not None}).config
+    tree = with_trees(loaded(config, settings, port, {k: v for k, v in flags.items() if v is not None}).config)
     expected = expected_frames(tree)
-    tree = with_port(tree, fixed=port is not None)
-    tree = prepared(tree, autopilot)
-    return Run(tree, Console(stderr=True), logs, expected, as_json=as_json).to_the_end()
+
+    def configured() -> TreedockConfig:
+        return prepared(with_port(tree, fixed=port is not None), autopilot)
+
+    return Run(configured, Console(stderr=True), logs, expected, as_json=as_json).to_the_end()
+
+
+def with_trees(tree: TreedockConfig) -> TreedockConfig:
+    """Return ``tree`` with a random scene that holds as many trees as the mission is to visit, and the time for it."""
+    wanted, simulator = tree.navigator.trees_wanted, tree.simulator
+    if tree.camera.source != "sim" or wanted < _TREES_ANYWAY:
+        return tree
+    from services.simulator.catalogue import trees_to_ask_for
+
+    asked = simulator.trees
+    if asked is None:
+        asked = trees_to_ask_for(simulator.scene, simulator.seed, wanted)
+    limit_s = max(simulator.flight.limit_s, wanted * _SIMULATED_S_A_TREE)
+    within_s = max(tree.supervisor.mission_within_s, wanted * _WALL_S_A_TREE)
+    flight = simulator.flight.model_copy(update={"limit_s": limit_s})
+    return tree.model_copy(update={
+        "simulator": simulator.model_copy(update={"trees": asked, "flight": flight}),
+        "supervisor": tree.supervisor.model_copy(update={"mission_within_s": within_s}),
+    })  # fmt: skip
 
 
 def expected_frames(tree: TreedockConfig) -> int | None:
@@ -80,7 +104,7 @@ def expected_frames(tree: TreedockConfig) -> int | None:
     if tree.camera.source == "sim":
         from services.simulator.catalogue import scene_for
 
-        scene_for(tree.simulator.scene, tree.simulator.seed)
+        scene_for(tree.simulator.scene, tree.simulator.seed, tree.simulator.trees)
         return None
     if tree.camera.source == "realsense":
         from services.camera.sources.realsense import require_library
@@ -118,22 +142,36 @@ def services_for(tree: TreedockConfig) -> tuple[str, ...]:
     return (*chain, "simulator") if tree.camera.source == "sim" else chain
 
 
+class _PortTakenError(InputError):
+    """Another process took a port between our finding it free and the service's opening it."""
+
+
+_ON_PORTS = frozenset({"router", "autopilot", "simulator"})
+
+
 class Run:
     """One run, from the router's start to the summary."""
 
     def __init__(
-        self, tree: TreedockConfig, console: Console, logs: Path | None, expected: int | None, *, as_json: bool
-    ) -> None:
-        self._tree = tree
+        self, configured: Callable[[], TreedockConfig], console: Console, logs: Path | None, expected: int | None, *,
+        as_json: bool,
+    ) -> None:  # fmt: skip
+        self._configured = configured
+        """Gives the configuration with the ports that are free at this moment."""
+        self._tree = configured()
         self._expected = expected
         self._console = console
         self._as_json = as_json
         self._keep_logs = logs is not None
-        self._folder = logs or Path(tempfile.mkdtemp(prefix="treedock-run-"))
+        self._own_folder = logs is None
+        self._folder = logs or scratch.made()
         self._config_file = self._folder / "config.json"
+        self._write_config()
+
+    def _write_config(self) -> None:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            self._config_file.write_text(tree.model_dump_json(indent=1))
+            self._config_file.write_text(self._tree.model_dump_json(indent=1))
         except OSError as error:
             raise InputError(f"--logs {self._folder}: cannot be written: {error.strerror}") from None
 
@@ -143,26 +181,43 @@ class Run:
         Raises:
             InputError: a service refused its configuration or input; GoalNotReachedError: one could not be kept alive.
         """
-        from services.cli.supervisor import Supervisor
         from services.common.logging import set_up
         from services.common.stop import StopSignal
 
         set_up("run", "warning" if self._console.is_terminal else self._tree.log_level)
         stop = StopSignal()
         stop.install(force=False)
+        for left in reversed(range(_TRIES)):
+            try:
+                return self._attempt(stop)
+            except _PortTakenError as error:
+                if not left or stop.is_set:
+                    raise
+                self._console.print(f"treedock: {error}: trying another port", highlight=False, soft_wrap=True)
+                self._tree = self._configured()
+                self._write_config()
+        raise AssertionError("unreachable")
+
+    def _attempt(self, stop: StopSignal) -> int:
+        from services.cli.supervisor import Supervisor
+
         # a recording does not wait for its consumers as the simulator does
         last = frozenset[str]() if self._tree.camera.source == "sim" else frozenset({"camera"})
         supervisor = Supervisor(services_for(self._tree), self._spawn, self._tree.supervisor, last)
+        again = False
         try:
             return self._supervised(supervisor, stop)
+        except _PortTakenError:
+            again = True
+            raise
         except InputError:
             if stop.is_set:  # interrupted before the router was up
                 return _stopped(stop)
             raise
         finally:
             supervisor.stop_all()
-            if not self._keep_logs and supervisor.restarts == 0:
-                shutil.rmtree(self._folder, ignore_errors=True)
+            if self._own_folder and not again:
+                scratch.let_go(self._folder, keep=self._keep_logs or supervisor.restarts > 0)
 
     def _spawn(self, name: str) -> subprocess.Popen[bytes]:
         """Start a service as a process group of its own: Ctrl-C in the terminal reaches it through us alone."""
@@ -200,7 +255,9 @@ class Run:
     def _conductor(self, watch: Watch) -> Conductor | None:
         from services.cli.mission import Conductor, flies
 
-        return Conductor(watch, self._tree.supervisor.mission_within_s) if flies(self._tree) else None
+        if not flies(self._tree):
+            return None
+        return Conductor(watch, self._tree.supervisor.mission_within_s, self._tree.navigator.trees_wanted)
 
     def _still_waiting(self, supervisor: Supervisor, stop: StopSignal) -> Callable[[], bool]:
         def given_up() -> bool:
@@ -240,7 +297,8 @@ class Run:
         self._keep_logs = True
         last = _last_line(self._folder / f"{child.name}.log").removeprefix("treedock: ")
         if child.last_fault.endswith("exit code 2"):
-            raise InputError(last)
+            self._keep_logs = False
+            raise _PortTakenError(last) if "in use" in last and child.name in _ON_PORTS else InputError(last)
         raise GoalNotReachedError(f"{child.name} {child.last_fault} {child.deaths_in_a_row} times before it was ready: "
                                   f"{last} (all of it in {self._folder / child.name}.log)")  # fmt: skip
 

@@ -30,15 +30,18 @@ class Record(Protocol):
     truths: list[SimTruth]
 
 
-def mission_figures(record: Record) -> dict[str, Any]:
-    """Return how a mission ended: state, reason, each docking believed and true, touches, clearance, events."""
+def mission_figures(record: Record, trees_wanted: int = 1) -> dict[str, Any]:
+    """Return how a mission ended: state, reason, each docking believed and true, touches, clearance, events.
+
+    ``docked``: at as many trees as were wanted, each of them well.
+    """
     states = record.states
     last = states[-1] if states else None
     docks = [_dock(record, state) for state in _entered(states, "docked")]
     values: dict[str, Any] = {
         "state": last.state if last else "idle",
         "reason": last.reason if last else "never started",
-        "docked": bool(docks) and all(dock["good"] for dock in docks),
+        "docked": len(docks) >= max(trees_wanted, 1) and all(dock["good"] for dock in docks),
         "docks": docks,
         "events": [{"s": round(s.since_ns * 1e-9, 2), "state": s.state, "reason": s.reason} for s in _events(states)],
     }

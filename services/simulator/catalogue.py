@@ -118,3 +118,23 @@ def scene_for(name: str, seed: int, trees: int | None = None) -> Scene:
     if head == "random" and kind in KINDS:
         return random_scene(seed, kind, trees)
     return scene_by_name(name)
+
+
+def trees_to_ask_for(name: str, seed: int, wanted: int) -> int | None:
+    """Return how many suitable trees to ask for so that a random scene has ``wanted`` that can be docked at.
+
+    None where the scene as it is has enough, or where it has its name and with it its trees.
+
+    Raises:
+        InputError: no scene of this kind and seed has room for so many.
+    """
+    head, _, kind = name.partition("-")
+    if head != "random" or kind not in KINDS or len(scene_for(name, seed).reachable_trees) >= wanted:
+        return None
+    for count in range(wanted, wanted + _SPARE_TREES + 1):
+        if len(scene_for(name, seed, count).reachable_trees) >= wanted:
+            return count
+    raise InputError(f"--trees {wanted}: scene {name} of seed {seed} has no room for so many; ask for fewer")
+
+
+_SPARE_TREES = 6

@@ -179,3 +179,39 @@ class Scene:
     def suitable_trees(self) -> tuple[SceneTree, ...]:
         """Return the trees that the mission may choose."""
         return tuple(tree for tree in self.trees if tree.suitable)
+
+    @property
+    def reachable_trees(self) -> tuple[SceneTree, ...]:
+        """Return the suitable trees with a free place in front of them, and none in the line of sight to the start."""
+        return tuple(tree for tree in self.suitable_trees if self._has_place(tree) and not self._hidden(tree))
+
+    def _things(self, but: SceneTree) -> list[tuple[float, float, float]]:
+        """Return x, y and radius of all that stands here."""
+        found = [(t.x_m, t.y_m, t.radius_m) for t in self.trees if t is not but]
+        found += [(p.x_m, p.y_m, p.radius_m) for p in self.posts]
+        found += [(b.x_m, b.y_m, b.radius_m) for b in self.bushes]
+        found += [(t.x_m, t.y_m, 0.5 * math.hypot(t.length_m, t.width_m)) for t in self.tables]
+        return found + [(p.x_m, p.y_m, _PERSON_RADIUS_M) for p in self.people]
+
+    def _has_place(self, tree: SceneTree) -> bool:
+        things = self._things(tree)
+        for k in range(_AZIMUTHS):
+            angle = 2.0 * math.pi * k / _AZIMUTHS
+            x, y = tree.x_m + _DOCK_M * math.cos(angle), tree.y_m + _DOCK_M * math.sin(angle)
+            if all(math.hypot(x - a, y - b) - r >= _ROOM_M for a, b, r in things):
+                return True
+        return False
+
+    def _hidden(self, tree: SceneTree) -> bool:
+        """Whether something as tall as the camera flies hides the trunk's middle from the start."""
+        length = math.hypot(tree.x_m, tree.y_m)
+        for x, y, radius in [(t.x_m, t.y_m, t.radius_m) for t in self.trees if t is not tree]:
+            along = (x * tree.x_m + y * tree.y_m) / length
+            if 0.0 < along < length and abs(x * tree.y_m - y * tree.x_m) / length < radius:
+                return True
+        return False
+
+
+_DOCK_M, _ROOM_M, _AZIMUTHS = 0.95, 0.60, 36
+"""Where docking is, and the room that an aircraft of 0.35 m radius asks for there."""
+_PERSON_RADIUS_M = 0.3

@@ -1,0 +1,93 @@
+"""What ``treedock run`` decides before it starts anything: scene, time, folders, ports taken by others."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from schemas.navigation import MissionState
+from services.cli import run as run_module
+from services.cli import scratch
+from services.cli.mission import Flown
+from services.cli.run import Run, with_trees
+from services.common.config import TreedockConfig
+from services.common.errors import InputError
+from services.common.stop import StopSignal
+from services.evaluate.flown import mission_figures
+from services.simulator.catalogue import scene_for, trees_to_ask_for
+
+
+def _tree(**simulator: object) -> TreedockConfig:
+    wanted = int(simulator.pop("wanted", 3))  # type: ignore[call-overload]
+    return TreedockConfig.model_validate(
+        {"camera": {"source": "sim"}, "navigator": {"trees_wanted": wanted}, "simulator": simulator}
+    )
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("wanted", [2, 3, 5])
+def test_the_scene_holds_as_many_trees_as_the_mission_is_to_visit(seed: int, wanted: int) -> None:
+    tree = with_trees(_tree(seed=seed, wanted=wanted))
+    scene = scene_for(tree.simulator.scene, tree.simulator.seed, tree.simulator.trees)
+    assert len(scene.reachable_trees) >= wanted
+    assert tree.simulator.flight.limit_s >= 120.0 * wanted
+
+
+def test_one_tree_changes_nothing_and_a_scene_with_a_name_keeps_its_trees() -> None:
+    assert with_trees(_tree(seed=3, wanted=1)) == _tree(seed=3, wanted=1)
+    assert trees_to_ask_for("multi-01", 1, 5) is None
+    assert with_trees(_tree(seed=3, trees=2)).simulator.trees == 2
+    with pytest.raises(InputError, match="no room"):
+        trees_to_ask_for("random-single", 1, 60)
+
+
+def test_a_run_of_three_trees_is_done_with_three_docks_only() -> None:
+    flown = Flown([_state("docked", 1, 1), _state("undock", 2, 1), _state("docked", 3, 2), _state("landed", 4, 2)])
+    assert mission_figures(flown, 2)["docked"]
+    assert not mission_figures(flown, 3)["docked"]
+
+
+def _state(name: str, since_ns: int, docked: int) -> MissionState:
+    return MissionState(
+        stamp_ns=since_ns, seq=since_ns, map_id="m", state=name, previous="idle", since_ns=since_ns, reason="r",
+        target_tree_id=None, visited_tree_ids=(), docked_count=docked, distance_m=None, heading_error_rad=None,
+    )  # type: ignore[arg-type]  # fmt: skip
+
+
+def test_folders_of_killed_runs_are_cleared_away_and_no_others(tmp_path: Path) -> None:
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    owners = {"dead": f"{dead.pid} 12345", "alive": f"{os.getpid()} {scratch._began(os.getpid())}", "odd": "what"}
+    for name, owner in owners.items():
+        (tmp_path / f"treedock-run-{name}").mkdir()
+        (tmp_path / f"treedock-run-{name}" / "owner").write_text(owner)
+    (tmp_path / "treedock-run-kept").mkdir()
+    assert [p.name for p in scratch.clear_stale(tmp_path)] == ["treedock-run-dead"]
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_a_port_lost_to_another_process_is_chosen_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ports = iter(range(7001, 7010))
+    tried: list[int] = []
+
+    def configured() -> TreedockConfig:
+        base = TreedockConfig()
+        return base.model_copy(update={"router": base.router.model_copy(update={"port": next(ports)})})
+
+    def attempt(self: Run, stop: StopSignal) -> int:
+        del stop
+        tried.append(self._tree.router.port)
+        if len(tried) < 3:
+            raise run_module._PortTakenError("port 7001 on 127.0.0.1 is in use: ...")
+        return 0
+
+    monkeypatch.setattr(Run, "_attempt", attempt)
+    made = Run(configured, Console(quiet=True), tmp_path, None, as_json=False)
+    assert made.to_the_end() == 0
+    assert tried == [7001, 7002, 7003]
+    assert '"port": 7003' in (tmp_path / "config.json").read_text()
