@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from services.detector.refine.candidates import Fit
-from services.detector.refine.model import ExpectedTree, Matrix
+from services.detector.refine.model import ExpectedTree, Matrix, inverse_2x2
 
 _MATCH_REWARD = 8.0
 """Half the squared Mahalanobis distance at which an object is no longer taken for a tree."""
@@ -42,7 +42,7 @@ def associate(
     """
     if not fits:
         return None
-    information = np.linalg.inv(shift_covariance + np.eye(2) * _MIN_SHIFT_SIGMA_M**2)
+    information = inverse_2x2(shift_covariance + np.eye(2) * _MIN_SHIFT_SIGMA_M**2)
     shifts = [np.zeros(2)]
     for _, place in trees:
         shifts += [fit.parameters[:2] - place for fit in fits]

@@ -8,22 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.camera import Intrinsics
-from services.detector.refine import kernels_fit, kernels_scan
+from services.detector.refine import kernels_fit, kernels_object, kernels_scan
 from services.detector.refine.config import RefinerConfig
-from services.detector.refine.kernels_scan import (
-    FIRST,
-    HOLE,
-    LAST,
-    LEFT_KIND,
-    LEFT_RAD,
-    MAX_M,
-    MIN_M,
-    NEAR_M,
-    RIGHT_KIND,
-    RIGHT_RAD,
-    ROW,
-    SILHOUETTE,
-)
 from services.detector.refine.model import Depth, ExpectedTree, Matrix, Sight
 from services.detector.refine.view import ray_table, window_rows
 
@@ -102,58 +88,27 @@ def candidates(
     fits = []
     sizes = np.bincount(found.label, minlength=found.objects)
     least = max(config.search.min_rows, int(config.search.min_height_share * len(found.rows)))
-    order = np.argsort(-sizes, kind="stable")[:_MAX_OBJECTS]
+    rows, start = _as_rows(trees, config), np.empty(kernels_fit.PARAMETERS)
+    radii = np.array([config.fit.min_radius_m, config.fit.max_radius_m])
+    order = np.argsort(-sizes, kind="stable")[:_MAX_OBJECTS].tolist()
     for k in order:
         if sizes[k] < least:
             break
-        start = _start(found, int(k), trees, reach_m, config)
-        if start is not None:
-            fit = fit_object(found, int(k), start, start, config, quick=True)
+        if kernels_object.object_start(
+            found.runs, found.label, k, rows, reach_m, config.search.max_spread_m, radii, start
+        ):
+            fit = fit_object(found, k, start, start, config, quick=True)
             if fit is not None:
                 fits.append(fit)
     return fits
 
 
-def _start(
-    found: Scan, k: int, trees: list[tuple[ExpectedTree, Matrix]], reach_m: float, config: RefinerConfig
-) -> Matrix | None:
-    """Return a first circle (5,) for an object, or None when it cannot be any of the trees."""
-    runs = found.runs[found.label == k]
-    near = _median(runs[:, NEAR_M])
-    # medians and tenths: mixed pixels at the edges stretch single rows
-    tenth, ordered = len(runs) // 10, np.sort(runs[:, NEAR_M])
-    spread = max(ordered[-1 - tenth] - ordered[tenth], _median(runs[:, MAX_M] - runs[:, MIN_M]))
-    if spread > config.search.max_spread_m:
-        return None
-    middle = 0.5 * (runs[:, LEFT_RAD] + runs[:, RIGHT_RAD])
-    half = 0.5 * (runs[:, LEFT_RAD] - runs[:, RIGHT_RAD])
-    whole = _free(runs[:, LEFT_KIND]) & _free(runs[:, RIGHT_KIND])
-    use = whole if int(np.sum(whole)) * 3 >= len(runs) else np.ones(len(runs), dtype=bool)
-    bearing, sine = _median(middle[use]), float(np.sin(np.clip(_median(half[use]), 0.0, 1.2)))
-    seen_radius = near * sine / max(1.0 - sine, 0.1)
-    best: Matrix | None = None
-    best_distance = reach_m
-    for tree, place in trees:
-        limit = max(config.fit.max_radius_change_m, 3.0 * tree.sigma_radius_m)
-        if seen_radius > 1.6 * (tree.radius_m + limit):
-            continue
-        radius = seen_radius if use is whole else tree.radius_m
-        radius = float(np.clip(radius, config.fit.min_radius_m, config.fit.max_radius_m))
-        centre = (near + radius) * np.array([np.cos(bearing), np.sin(bearing)])
-        distance = float(np.hypot(*(centre - place)))
-        if distance < best_distance:
-            best_distance = distance
-            best = np.array([centre[0], centre[1], radius, 0.0, 0.0])
-    return best
-
-
-def _median(values: Matrix) -> float:
-    """Return the upper median; np.median takes ten times as long on so few numbers."""
-    return float(np.sort(values)[len(values) // 2])
-
-
-def _free(kind: Matrix) -> NDArray[np.bool_]:
-    return (kind == SILHOUETTE) | (kind == HOLE)
+def _as_rows(trees: list[tuple[ExpectedTree, Matrix]], config: RefinerConfig) -> Matrix:
+    """Return (T, 4): place, radius, and by how much the radius may differ."""
+    change = config.fit.max_radius_change_m
+    return np.array([
+        (place[0], place[1], tree.radius_m, max(change, 3.0 * tree.sigma_radius_m)) for tree, place in trees
+    ])  # fmt: skip
 
 
 def fit_object(
@@ -181,7 +136,10 @@ def fit_object(
     if not good or stats[0] < 3:
         return None
     rms = float(np.sqrt(stats[1] / stats[0]))
-    covariance = np.asarray(np.linalg.inv(H) * (fit.correlation * max(1.0, rms * rms)), dtype=np.float64)
+    covariance = np.empty((5, 5))
+    if not kernels_fit.invert(H, covariance):
+        return None
+    covariance *= fit.correlation * max(1.0, rms * rms)
     return Fit(k, p, covariance, int(stats[0]), float(stats[0] / stats[2]), rms)
 
 
@@ -195,7 +153,7 @@ def join_alike(found: Scan, fit: Fit, fits: list[Fit]) -> None:
 
 def extent(found: Scan, k: int) -> tuple[tuple[float, float], tuple[int, int], float]:
     """Return (left and right column, first and last row, angle seen from the camera) of an object."""
-    runs = found.runs[found.label == k]
-    columns = (_median(runs[:, FIRST]), _median(runs[:, LAST]))
-    angle = _median(runs[:, LEFT_RAD] - runs[:, RIGHT_RAD])
-    return columns, (int(runs[0, ROW]), int(runs[-1, ROW])), angle
+    out = np.empty(5)
+    kernels_object.object_extent(found.runs, found.label, k, out)
+    left, right, first, last, angle = out.tolist()
+    return (left, right), (int(first), int(last)), angle

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-
-import numpy as np
 
 from schemas.camera import Intrinsics
 from services.detector.refine.model import ExpectedTree, Matrix
-from services.detector.refine.view import axis_point, project
+from services.detector.refine.view import axis_xy, project_point
 
 _MIN_FORWARD_M = 0.2
 _KEEP_M = 0.4
@@ -17,11 +16,13 @@ _KEEP_M = 0.4
 
 def image_place(tree: ExpectedTree, T_map_camera: Matrix, intrinsics: Intrinsics) -> tuple[float, float] | None:
     """Return (image x, range) of the axis at the camera's height; None when it is not before the camera."""
-    offset = np.append(axis_point(tree, float(T_map_camera[2, 3])) - T_map_camera[:2, 3], 0.0)
-    in_camera = offset @ T_map_camera[:3, :3]
-    if in_camera[2] < _MIN_FORWARD_M:
+    (a, b, c, camera_x), (d, e, f, camera_y), (_, _, _, camera_z) = T_map_camera[:3].tolist()
+    x, y = axis_xy(tree, camera_z)
+    x, y = x - camera_x, y - camera_y
+    forward = x * c + y * f
+    if forward < _MIN_FORWARD_M:
         return None
-    return float(project(in_camera[None], intrinsics)[0, 0]), float(np.hypot(offset[0], offset[1]))
+    return project_point(x * a + y * d, x * b + y * e, forward, intrinsics)[0], math.hypot(x, y)
 
 
 def in_view(tree: ExpectedTree, T_map_camera: Matrix, intrinsics: Intrinsics, max_range_m: float) -> float | None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.detector.refine.model import ExpectedTree, Matrix, Measurement
+from services.detector.refine.model import ExpectedTree, Matrix, Measurement, inverse_2x2, largest_eigenvalue_2x2
 
 _DRIFT_M = 0.003
 """Per measurement: pose and map drift against each other, so old measurements fade."""
@@ -32,7 +32,7 @@ class Correction:
     def fused(self, measured: Measurement, tree: ExpectedTree) -> Correction:
         """Return the correction after a measurement made with ``applied(tree)`` as the expected tree."""
         P = self.covariance + np.eye(2) * _DRIFT_M**2
-        gain = P @ np.linalg.inv(P + measured.covariance_map_m2)
+        gain = P @ inverse_2x2(P + measured.covariance_map_m2)
         variance = self.radius_variance + (0.1 * _DRIFT_M) ** 2
         weight = variance / (variance + float(measured.covariance[2, 2]))
         radius = self.radius_m + weight * (measured.radius_m - tree.radius_m - self.radius_m)
@@ -45,7 +45,7 @@ class Correction:
 
     def applied(self, tree: ExpectedTree) -> ExpectedTree:
         """Return the map's tree with the correction."""
-        sigma = float(np.sqrt(max(np.linalg.eigvalsh(self.covariance)[-1], _MIN_SIGMA_M**2)))
+        sigma = float(np.sqrt(max(largest_eigenvalue_2x2(self.covariance), _MIN_SIGMA_M**2)))
         return replace(
             tree, x_m=tree.x_m + float(self.shift_m[0]), y_m=tree.y_m + float(self.shift_m[1]), sigma_xy_m=sigma,
             radius_m=max(tree.radius_m + self.radius_m, 0.01),

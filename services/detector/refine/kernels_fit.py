@@ -41,7 +41,7 @@ _DAMPING = 1e-6
 _GRAZING = 0.12
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def gather_points(
     depth: Depth, ray_x: Depth, ray_y: Depth, M: Matrix, runs: Matrix, label: NDArray[np.int64], count: int,
     wanted: int, max_points: int, noise: Matrix, points: Matrix,
@@ -73,7 +73,7 @@ def gather_points(
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def gather_edges(runs: Matrix, label: NDArray[np.int64], count: int, wanted: int, edges: Matrix) -> int:
     """Fill ``edges`` (N, 4) with the object's silhouettes (background, or no data, beside them); return how many."""
     n = 0
@@ -92,7 +92,7 @@ def gather_edges(runs: Matrix, label: NDArray[np.int64], count: int, wanted: int
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def predicted_depth(q1: float, q2: float, h: float, p: Matrix) -> tuple[float, float]:
     """Return (depth, discriminant) of a ray on the trunk p; a ray that misses gives its nearest approach, and <= 0."""
     x, y = q1 - p[3] * h, q2 - p[4] * h
@@ -102,7 +102,7 @@ def predicted_depth(q1: float, q2: float, h: float, p: Matrix) -> tuple[float, f
     return (b - math.sqrt(max(d, 0.0))) / a, d
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def point_row(point: Matrix, p: Matrix, lateral: float, jacobian: Matrix) -> tuple[float, float]:
     """Return (residual, sigma), metres of depth, and fill ``jacobian`` (5,) = d residual / d p.
 
@@ -130,7 +130,7 @@ def point_row(point: Matrix, p: Matrix, lateral: float, jacobian: Matrix) -> tup
     return z - predicted, math.sqrt(sigma * sigma + slope * slope)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _edge_row(edge: Matrix, p: Matrix, jacobian: Matrix) -> float:
     """Return the residual, metres, of a ray that should touch the circle: signed distance of the centre, less r."""
     reach = edge[0] * p[0] + edge[1] * p[1]
@@ -142,7 +142,7 @@ def _edge_row(edge: Matrix, p: Matrix, jacobian: Matrix) -> float:
     return n1 * p[0] + n2 * p[1] - p[2]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _accumulate(H: Matrix, g: Matrix, jacobian: Matrix, residual: float, weight: float) -> None:
     for i in range(PARAMETERS):
         wj = weight * jacobian[i]
@@ -151,7 +151,7 @@ def _accumulate(H: Matrix, g: Matrix, jacobian: Matrix, residual: float, weight:
             H[i, j] += wj * jacobian[j]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _add_points(
     points: Matrix, n: int, p: Matrix, lateral: float, tukey: float, scale: float, H: Matrix, g: Matrix, stats: Matrix
 ) -> None:
@@ -169,7 +169,7 @@ def _add_points(
     stats[2] = n
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _add_edges(edges: Matrix, n: int, p: Matrix, sigma: float, tukey: float, H: Matrix, g: Matrix) -> None:
     """Add the silhouettes; each side has the weight of one row, as its error is common to all rows."""
     jacobian = np.empty(PARAMETERS)
@@ -187,7 +187,7 @@ def _add_edges(edges: Matrix, n: int, p: Matrix, sigma: float, tukey: float, H: 
                 _accumulate(H, g, jacobian, residual, share * share / (sigma * sigma * rows))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def solve(H: Matrix, g: Matrix, x: Matrix) -> bool:
     """Solve H x = g (symmetric, upper triangle given) by Cholesky; False when H is not positive definite."""
     n = g.size
@@ -216,7 +216,20 @@ def solve(H: Matrix, g: Matrix, x: Matrix) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
+def invert(H: Matrix, inverse: Matrix) -> bool:
+    """Fill the inverse of a symmetric positive definite matrix; False when it is none."""
+    unit, column = np.zeros(H.shape[0]), np.empty(H.shape[0])
+    for k in range(H.shape[0]):
+        unit[:] = 0.0
+        unit[k] = 1.0
+        if not solve(H, unit, column):
+            return False
+        inverse[:, k] = column
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def fit_trunk(
     points: Matrix, n: int, edges: Matrix, n_edges: int, start: Matrix, prior: Matrix, prior_sigma: Matrix,
     lateral: float, tukey: float, iterations: int, narrowing: int, p: Matrix, H: Matrix, stats: Matrix,

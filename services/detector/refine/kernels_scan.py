@@ -21,7 +21,7 @@ _LOOK_BESIDE_PX = 8
 _MAX_GAP_PX = 3
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def scan_rows(
     depth: Depth, ray_x: Depth, ray_y: Depth, M: Matrix, up_row: Matrix, camera_z_m: float,
     rows: NDArray[np.int64], u0: int, u1: int, limits: Matrix, noise: Matrix, runs: Matrix,
@@ -52,7 +52,7 @@ def scan_rows(
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def jump_m(z: float, apart_px: int, noise: Matrix) -> float:
     """Return the step of depth that parts two surfaces: more than noise and a cylinder's own slope.
 
@@ -62,7 +62,7 @@ def jump_m(z: float, apart_px: int, noise: Matrix) -> float:
     return 3.5 * sigma + math.sqrt(0.2 * z * noise[2] * apart_px)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _inside(z: float, x: float, y: float, M: Matrix, up_row: Matrix, camera_z_m: float, limits: Matrix) -> bool:
     height = camera_z_m + z * (up_row[0] * x + up_row[1] * y + up_row[2])
     if height < limits[2] or height > limits[3]:
@@ -73,7 +73,7 @@ def _inside(z: float, x: float, y: float, M: Matrix, up_row: Matrix, camera_z_m:
     return limits[4] * limits[4] < square < limits[5] * limits[5]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _ray(ray_x: Depth, ray_y: Depth, M: Matrix, v: int, u: int) -> tuple[float, float, float]:
     x, y = ray_x[v, u], ray_y[v, u]
     return (
@@ -83,7 +83,7 @@ def _ray(ray_x: Depth, ray_y: Depth, M: Matrix, v: int, u: int) -> tuple[float, 
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _beside(depth: Depth, v: int, u: int, step: int, noise: Matrix) -> float:
     """Say what lies beyond the run's end u: the first depth there, judged against the run's own."""
     z = depth[v, u]
@@ -104,7 +104,7 @@ def _beside(depth: Depth, v: int, u: int, step: int, noise: Matrix) -> float:
     return HOLE
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _close(
     depth: Depth, ray_x: Depth, ray_y: Depth, M: Matrix, v: int, first: int, last: int, limits: Matrix,
     noise: Matrix, runs: Matrix, count: int,
@@ -141,7 +141,7 @@ def _close(
     return count + 1
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def link_runs(runs: Matrix, count: int, row_step: int, noise: Matrix, label: NDArray[np.int64]) -> int:
     """Link runs of neighbouring rows into objects: they overlap across and agree in distance. Returns their number.
 

@@ -8,11 +8,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from schemas.camera import Intrinsics
+from services.detector.refine import kernels_place
 from services.detector.refine.associate import associate
 from services.detector.refine.candidates import Fit, Scan, candidates, extent, fit_object, join_alike, scan
 from services.detector.refine.config import RefinerConfig
 from services.detector.refine.model import Depth, ExpectedTree, Matrix, Measurement, Sight
-from services.detector.refine.view import axis_point, gate_m, pose_offset_covariance, project, sight, window
+from services.detector.refine.view import axis_point, gate_m, pose_offset_covariance, project_point, sight, window
 
 _NO_POSE_ERROR = np.zeros((2, 2))
 _MIN_DEPTH_M = 0.1
@@ -103,20 +104,15 @@ def _measurement(
     config: RefinerConfig,
 ) -> Measurement | None:  # fmt: skip
     view = found.sight
-    offset, J = axis_offset(fit.parameters, view.basis)
-    distance = float(np.hypot(offset[0], offset[1]))
+    offset, covariance, polar_covariance = np.empty(2), np.empty((3, 3)), np.empty((3, 3))
+    distance = kernels_place.polar(
+        fit.parameters, fit.covariance, view.basis, config.fit.systematic_m, offset, covariance, polar_covariance
+    )
     f = view.forward
     bearing = math.atan2(f[0] * offset[1] - f[1] * offset[0], f[0] * offset[0] + f[1] * offset[1])
-    axis_camera = np.append(offset, 0.0) @ T_map_camera[:3, :3]
-    if axis_camera[2] < _MIN_DEPTH_M:
+    x, y, z = (offset @ T_map_camera[:2, :3]).tolist()
+    if z < _MIN_DEPTH_M:
         return None
-    covariance = J @ fit.covariance @ J.T
-    covariance += _systematic(offset / distance, config.fit.systematic_m)
-    to_polar = np.array([
-        [-offset[1] / distance**2, offset[0] / distance**2, 0.0],
-        [offset[0] / distance, offset[1] / distance, 0.0],
-        [0.0, 0.0, 1.0],
-    ])  # fmt: skip
     columns, rows, angle = extent(found, fit.object)
     position = view.camera_m[:2] + offset
     moved = position - axis_point(tree, float(view.camera_m[2]))
@@ -124,38 +120,10 @@ def _measurement(
     half = math.asin(min(float(fit.parameters[2]) / distance, 0.99))
     return Measurement(
         tree_id=tree.id, bearing_rad=bearing, range_m=distance, radius_m=float(fit.parameters[2]),
-        image_x_px=float(project(axis_camera[None], intrinsics)[0, 0]),
-        covariance=to_polar @ covariance @ to_polar.T,
+        image_x_px=project_point(x, y, z, intrinsics)[0],
+        covariance=polar_covariance,
         position_map_m=(float(position[0]), float(position[1])), covariance_map_m2=covariance[:2, :2] + shift,
         rms=fit.rms, inliers=fit.inliers, inlier_share=fit.inlier_share,
         arc_rad=min(1.0, 0.5 * angle / half) * (math.pi - 2.0 * half), columns_px=columns, rows_px=rows,
         shift_m=(float(moved[0]), float(moved[1])),
     )  # fmt: skip
-
-
-def _systematic(away: Matrix, sigma_m: float) -> Matrix:
-    """Return the (3, 3) covariance of what more pixels do not average: mostly along the ray and in the radius.
-
-    Both silhouettes are seen, so across the ray a third of it remains (measured on simulated views).
-    """
-    along, across = sigma_m**2, (sigma_m / 3.0) ** 2
-    x, y = float(away[0]), float(away[1])
-    d = along - across
-    return np.array([[across + d * x * x, d * x * y, 0.0], [d * x * y, across + d * y * y, 0.0], [0.0, 0.0, along]])
-
-
-def axis_offset(parameters: Matrix, basis: Matrix) -> tuple[Matrix, Matrix]:
-    """Return where the fitted axis passes the camera's height, (2,) from the camera in map's axes, and its Jacobian.
-
-    The Jacobian (3, 5) is of (offset x, offset y, radius) with respect to the fit's parameters.
-    """
-    c = parameters[0] * basis[0] + parameters[1] * basis[1]
-    d = parameters[3] * basis[0] + parameters[4] * basis[1] + basis[2]
-    s = -c[2] / d[2]
-    J = np.zeros((3, 5))
-    for k in range(2):
-        b = basis[k]
-        J[:2, k] = b[:2] - b[2] / d[2] * d[:2]
-        J[:2, 3 + k] = s * (b[:2] - b[2] / d[2] * d[:2])
-    J[2, 2] = 1.0
-    return (c + s * d)[:2], J

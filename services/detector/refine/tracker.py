@@ -16,7 +16,7 @@ from services.detector.refine.kalman import TargetFilter
 from services.detector.refine.model import Depth, ExpectedTree, Matrix, Measurement
 from services.detector.refine.refine import refine
 from services.detector.refine.state import TargetState
-from services.detector.refine.view import bearing_of_column, place_in_map, pose_offset_covariance, project
+from services.detector.refine.view import bearing_of_column, place_in_map, pose_offset_covariance, project_point
 
 _MAX_DT_S = 1.0
 _STALE_POSE_COVARIANCE = np.diag([0.1, 0.1, 0.05, 0.03, 0.03, 0.06]) ** 2
@@ -158,12 +158,12 @@ class RefinerTracker:
             return
         moved = None
         if known_pose and self._place_map_m is not None:
-            offset = np.append(self._place_map_m - T[:2, 3], 0.0)
-            in_camera = offset @ T[:3, :3]
-            if in_camera[2] > 0.1:
-                x, distance, _ = self._filter.values
-                now = float(project(in_camera[None], intrinsics)[0, 0])
-                moved = (now - x, float(np.hypot(offset[0], offset[1])) - distance)
+            offset = self._place_map_m - T[:2, 3]
+            x, y, z = (offset @ T[:2, :3]).tolist()
+            if z > 0.1:
+                column, distance, _ = self._filter.values
+                now = project_point(x, y, z, intrinsics)[0]
+                moved = (now - column, float(np.hypot(offset[0], offset[1])) - distance)
         self._filter.predict(dt_s, moved, intrinsics.fx)
 
     def _measure(

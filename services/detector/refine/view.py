@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.camera import Intrinsics
+from services.detector.refine import kernels_place
 from services.detector.refine.config import SearchConfig
-from services.detector.refine.model import Depth, ExpectedTree, Matrix, Sight
+from services.detector.refine.model import Depth, ExpectedTree, Matrix, Sight, largest_eigenvalue_2x2
 
-_MIN_FORWARD_M = 0.15
 _UNDISTORT_ITERATIONS = 12
 _MIN_HORIZONTAL = 0.2
+_Number = TypeVar("_Number", float, Matrix)
 
 
 @lru_cache(maxsize=4)
@@ -31,7 +34,7 @@ def ray_table(intrinsics: Intrinsics) -> tuple[Depth, Depth]:
     return np.ascontiguousarray(x, dtype=np.float32), np.ascontiguousarray(y, dtype=np.float32)
 
 
-def distort(x: Matrix, y: Matrix, i: Intrinsics) -> tuple[Matrix, Matrix]:
+def distort(x: _Number, y: _Number, i: Intrinsics) -> tuple[_Number, _Number]:
     """Return distorted normalised coordinates (OpenCV's model: Brown 1966 with k1 k2 k3 p1 p2)."""
     r2 = x * x + y * y
     radial = 1.0 + r2 * (i.k1 + r2 * (i.k2 + r2 * i.k3))
@@ -49,27 +52,33 @@ def project(points_camera_m: Matrix, i: Intrinsics) -> Matrix:
     return np.stack([i.fx * x + i.cx, i.fy * y + i.cy], axis=1)
 
 
+def project_point(x: float, y: float, z: float, i: Intrinsics) -> tuple[float, float]:
+    """Return the pixel of one point before the camera."""
+    x, y = x / z, y / z
+    if i.distorted:
+        x, y = distort(x, y, i)
+    return i.fx * x + i.cx, i.fy * y + i.cy
+
+
 def sight(T_map_camera: Matrix, axis: tuple[float, float, float]) -> Sight | None:
     """Return the frame along a trunk, or None when the camera looks so far up or down that it has no heading."""
-    R = T_map_camera[:3, :3]
-    horizontal = R[:2, 2]
-    length = float(np.hypot(horizontal[0], horizontal[1]))
-    if length < _MIN_HORIZONTAL:
+    R = np.ascontiguousarray(T_map_camera[:3, :3])
+    basis, forward = np.empty((3, 3)), np.empty(2)
+    if not kernels_place.trunk_frame(R, np.array(axis), _MIN_HORIZONTAL, basis, forward):
         return None
-    a = np.asarray(axis, dtype=np.float64)
-    forward3 = np.array([horizontal[0] / length, horizontal[1] / length, 0.0])
-    away = forward3 - a * float(a @ forward3)
-    away /= np.linalg.norm(away)
-    left = np.array([a[1] * away[2] - a[2] * away[1], a[2] * away[0] - a[0] * away[2], a[0] * away[1] - a[1] * away[0]])
-    basis = np.stack([away, left, a])
-    return Sight(basis @ R, basis, R[2].copy(), T_map_camera[:3, 3].copy(), forward3[:2])
+    return Sight(basis @ R, basis, R[2].copy(), T_map_camera[:3, 3].copy(), forward)
 
 
 def axis_point(tree: ExpectedTree, z_map_m: float) -> Matrix:
     """Return the axis's (x, y) in map at the height ``z_map_m``."""
+    return np.array(axis_xy(tree, z_map_m))
+
+
+def axis_xy(tree: ExpectedTree, z_map_m: float) -> tuple[float, float]:
+    """Return the same as plain numbers."""
     ax, ay, az = tree.axis
     s = (z_map_m - tree.z_m) / max(az, 0.1)
-    return np.array([tree.x_m + s * ax, tree.y_m + s * ay])
+    return tree.x_m + s * ax, tree.y_m + s * ay
 
 
 def pose_offset_covariance(offset_m: Matrix, pose_covariance: Matrix) -> Matrix:
@@ -85,9 +94,8 @@ def pose_offset_covariance(offset_m: Matrix, pose_covariance: Matrix) -> Matrix:
 
 def gate_m(covariance: Matrix, config: SearchConfig) -> float:
     """Return how far from its expected place a tree is looked for."""
-    half_trace = 0.5 * (covariance[0, 0] + covariance[1, 1])
-    spread = np.hypot(0.5 * (covariance[0, 0] - covariance[1, 1]), covariance[0, 1])
-    return float(np.clip(config.gate_sigmas * np.sqrt(half_trace + spread), config.min_gate_m, config.max_gate_m))
+    sigma = math.sqrt(largest_eigenvalue_2x2(covariance))
+    return min(max(config.gate_sigmas * sigma, config.min_gate_m), config.max_gate_m)
 
 
 def window(
@@ -97,23 +105,15 @@ def window(
 
     The trunk between the search heights is widened by ``reach_m`` to both sides, towards the camera and away.
     """
-    R, t = T_map_camera[:3, :3], T_map_camera[:3, 3]
-    points = []
+    ends = []
     for height in (config.min_height_m, config.max_height_m):
         x, y = axis_point(tree, tree.z_m + height)
-        points.append((x, y, tree.z_m + height))
-    axis_camera = (np.array(points) - t) @ R
-    steps = axis_camera[1] - axis_camera[0]
-    samples = axis_camera[0] + np.linspace(0.0, 1.0, 9)[:, None] * steps
-    samples = samples[samples[:, 2] > _MIN_FORWARD_M]
-    if len(samples) == 0:
+        ends.append(np.array((x, y, tree.z_m + height)))
+    bounds = np.empty(4)
+    T = np.ascontiguousarray(T_map_camera)
+    if not kernels_place.window_bounds(ends[0], ends[1], T, _lens(intrinsics), reach_m, bounds):
         return None
-    pixels = project(samples, intrinsics)
-    near = np.maximum(samples[:, 2] - reach_m, _MIN_FORWARD_M)
-    half = intrinsics.fx * reach_m / near
-    extra = intrinsics.fy * reach_m / near
-    u0, u1 = np.min(pixels[:, 0] - half), np.max(pixels[:, 0] + half)
-    v0, v1 = np.min(pixels[:, 1]) - 0.3 * extra.max(), np.max(pixels[:, 1]) + 0.3 * extra.max()
+    u0, u1, v0, v1 = bounds.tolist()
     if u1 < 0 or v1 < 0 or u0 > intrinsics.width - 1 or v0 > intrinsics.height - 1:
         return None
     return (
@@ -122,6 +122,12 @@ def window(
         max(int(v0), 0),
         min(int(v1) + 1, intrinsics.height - 1),
     )
+
+
+@lru_cache(maxsize=4)
+def _lens(i: Intrinsics) -> Matrix:
+    """Return the camera as the kernels take it."""
+    return np.array([i.fx, i.fy, i.cx, i.cy, i.k1, i.k2, i.p1, i.p2, i.k3])
 
 
 def window_rows(v0: int, v1: int, count: int) -> NDArray[np.int64]:
@@ -136,28 +142,34 @@ def bearing_of_column(column_px: float, T_map_camera: Matrix, intrinsics: Intrin
     Bearings are from the camera's forward direction on the horizontal, positive to the left. For a level camera this
     is ``-atan((u - cx) / fx)``; for a tilted one the horizon's pixels lie on a slanted line.
     """
-    R = T_map_camera[:3, :3]
-    forward = R[:2, 2] / np.hypot(R[0, 2], R[1, 2])
-    a = forward[0] * R[0] + forward[1] * R[1]
-    b = -forward[1] * R[0] + forward[0] * R[1]
+    a, b = _horizon(T_map_camera)
     x = (column_px - intrinsics.cx) / intrinsics.fx
     if intrinsics.distorted:
         x = _undistorted_x(x, a, b, intrinsics)
-    bearing = float(np.arctan((x * a[2] - a[0]) / (b[0] - x * b[2])))
-    c, s = np.cos(bearing), np.sin(bearing)
+    bearing = math.atan((x * a[2] - a[0]) / (b[0] - x * b[2]))
+    c, s = math.cos(bearing), math.sin(bearing)
     n, d = a[0] * c + b[0] * s, a[2] * c + b[2] * s
     slope = ((b[0] * c - a[0] * s) * d - n * (b[2] * c - a[2] * s)) / d**2
-    return bearing, float(abs(slope)) * intrinsics.fx
+    return bearing, abs(slope) * intrinsics.fx
 
 
-def _undistorted_x(x_distorted: float, a: Matrix, b: Matrix, intrinsics: Intrinsics) -> float:
+def _horizon(T_map_camera: Matrix) -> tuple[list[float], list[float]]:
+    """Return, in the camera's axes, its horizontal heading and the horizontal direction to the left of it."""
+    x, y = T_map_camera[0, :3].tolist(), T_map_camera[1, :3].tolist()
+    length = math.hypot(x[2], y[2])
+    fx, fy = x[2] / length, y[2] / length
+    return [fx * p + fy * q for p, q in zip(x, y, strict=True)], [fx * q - fy * p for p, q in zip(x, y, strict=True)]
+
+
+def _undistorted_x(x_distorted: float, a: list[float], b: list[float], intrinsics: Intrinsics) -> float:
     """Return the undistorted x of a horizon pixel by fixed-point iteration."""
     x = x_distorted
     for _ in range(_UNDISTORT_ITERATIONS):
-        bearing = np.arctan((x * a[2] - a[0]) / (b[0] - x * b[2]))
-        direction = a * np.cos(bearing) + b * np.sin(bearing)
+        bearing = math.atan((x * a[2] - a[0]) / (b[0] - x * b[2]))
+        c, s = math.cos(bearing), math.sin(bearing)
+        direction = [p * c + q * s for p, q in zip(a, b, strict=True)]
         dx, _ = distort(direction[0] / direction[2], direction[1] / direction[2], intrinsics)
-        x += x_distorted - float(dx)
+        x += x_distorted - dx
     return x
 
 
