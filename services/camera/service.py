@@ -7,13 +7,16 @@ from collections.abc import Iterator
 
 from schemas.camera import ColourEncoding, RgbdFrame
 from schemas.topics import CAMERA_COMPRESSED, CAMERA_RGBD, SIM_RGBD
-from services.camera.codecs import FrameError, raw, recode
+from services.camera.codecs import FrameError, recode
+from services.camera.conditioning import Conditioner
 from services.camera.config import CameraConfig
-from services.camera.ranging import limit_frame
-from services.camera.sources import BadFrame, Source, open_source
+from services.camera.sources import BadFrame, ConditionedSource, open_source
+from services.camera.warm import warm
+from services.camera.watch import StreamWatch
 from services.common.context import Context
 
 _TICK_S = 0.005
+_SILENCE_TICK_S = 0.1
 _KEPT_NOTE_FRAMES = 30
 """A bad frame is told in health until this many good ones came after it."""
 
@@ -25,12 +28,15 @@ def build(context: Context) -> CameraService:
         InputError: the source cannot be opened.
     """
     config: CameraConfig = context.config.camera
+    warm()
     service = CameraService(context, config)
     if config.source == "sim":
-        context.on(SIM_RGBD, service.on_simulated)
+        simulated = Simulated(service, config)
+        context.on(SIM_RGBD, simulated.on_frame)
     else:
         replay = Replay(service, open_source(config.source, config), config)
         context.every(_TICK_S, replay.tick)
+        context.every(_SILENCE_TICK_S, replay.on_silence)
     return service
 
 
@@ -41,16 +47,6 @@ class CameraService:
         self.context = context
         self._config = config
         self._good_in_a_row = 0
-
-    def on_simulated(self, frame: RgbdFrame) -> None:
-        """Pass on a frame of the simulated sensor."""
-        try:
-            with self.context.health.timed("frame"):
-                limited = limit_frame(raw(frame), self._config.min_range_m, self._config.max_range_m)
-        except FrameError as error:
-            self.drop(str(error))
-            return
-        self.publish(limited)
 
     def publish(self, frame: RgbdFrame) -> None:
         """Send a frame; also compressed when somebody listens to that."""
@@ -72,11 +68,40 @@ class CameraService:
         self.context.health.count("dropped_bad_frame")
         self.context.health.note("frame", f"frame dropped: {reason}")
 
+    def tell_stream(self, counts: dict[str, int], note: str) -> None:
+        """Put what the watch found into health."""
+        self.context.health.counters.update(counts)
+        self.context.health.note("source", note)
+
+
+class Simulated:
+    """Passes on the simulated sensor's frames through the same watch and depth pipeline as a real one's."""
+
+    def __init__(self, service: CameraService, config: CameraConfig) -> None:
+        self._service = service
+        self._conditioner = Conditioner(config)
+        self._watch = StreamWatch(stall_s=config.stall_s)
+
+    def on_frame(self, frame: RgbdFrame) -> None:
+        """Condition and publish one frame."""
+        health = self._service.context.health
+        try:
+            with health.timed("frame"):
+                conditioned = self._conditioner.apply(frame)
+        except FrameError as error:
+            self._service.drop(str(error))
+            return
+        for stage, ms in self._conditioner.stage_ms.items():
+            health.stage_ms[stage].append(ms)
+        self._watch.see(conditioned.stamp_ns)
+        self._service.tell_stream(self._watch.counts(), self._watch.note())
+        self._service.publish(conditioned)
+
 
 class Replay:
     """Feeds a source's frames to the service when they are due."""
 
-    def __init__(self, service: CameraService, source: Source, config: CameraConfig) -> None:
+    def __init__(self, service: CameraService, source: ConditionedSource, config: CameraConfig) -> None:
         self._service = service
         self._source = source
         self._frames: Iterator[RgbdFrame | BadFrame] = iter(source)
@@ -85,6 +110,7 @@ class Replay:
         self._done = False
         self._first_ns: int | None = None
         self._begun_ns = 0
+        self._last_ns: int | None = None
 
     def tick(self) -> None:
         """Send the next frame when its time has come; at most one, so that a stop is never far."""
@@ -98,14 +124,40 @@ class Replay:
         item, self._next = self._next, None
         if isinstance(item, BadFrame):
             self._service.drop(item.reason)
+        elif self._frozen():
+            self._service.drop(
+                f"the camera has sent one and the same picture {self._source.watch.repeated_in_a_row} times"
+            )
         elif self._source.paced and self._config.restamp:
             self._service.publish(dataclasses.replace(item, stamp_ns=self._due_ns(item.stamp_ns)))
         else:
             self._service.publish(item)
 
+    def on_silence(self) -> None:
+        """Tell a sensor that stopped sending."""
+        if self._done or self._source.paced or self._last_ns is None:
+            return
+        watch, now_ns = self._source.watch, self._service.context.clock.now_ns()
+        if watch.silence((now_ns - self._last_ns) / 1e9):
+            self._service.tell_stream(watch.counts(), watch.note())
+
+    def _frozen(self) -> bool:
+        """Return whether a sensor repeats itself: it is then as good as dead, and the failsafe for that must see it."""
+        watch = self._source.watch
+        period_s = watch.period_s
+        repeated_s = watch.repeated_in_a_row * (period_s or 0.0)
+        return not self._source.paced and repeated_s > watch.stall_s
+
     def _fetch(self) -> bool:
-        with self._service.context.health.timed("frame"):
+        health = self._service.context.health
+        with health.timed("frame"):
             self._next = next(self._frames, None)
+        for stage, durations in self._source.stage_ms.items():
+            health.stage_ms[stage] += durations
+            durations.clear()
+        self._service.tell_stream(self._source.watch.counts(), self._source.note())
+        if isinstance(self._next, RgbdFrame):
+            self._last_ns = self._service.context.clock.now_ns()
         if self._next is None:
             self._done = True
             self._service.context.health.count("source_done")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def process(
-    sequence: Annotated[Path, typer.Argument(help="TUM RGB-D folder or MCAP recording", show_default=False)],
+    sequence: Annotated[Path, typer.Argument(help="TUM RGB-D folder, MCAP recording or ROS bag", show_default=False)],
     out: Annotated[Path, typer.Option("--out", help="Folder for the results", show_default=False)],
     *,
     skip_bad_frames: Annotated[
@@ -40,6 +40,8 @@ def process(
     tree = loaded(config, settings, None).config
     with _progress() as tell:
         values = process_sequence(sequence, out, tree, camera=camera, skip_bad_frames=skip_bad_frames, progress=tell)
+    if values["source_note"]:
+        typer.echo(f"treedock: {sequence}: {values['source_note']}", err=True)
     typer.echo(json.dumps(values) if as_json else _summary(values, out))
     if not values["frames"] or not values["tracked_final"]:
         from services.common.errors import GoalNotReachedError

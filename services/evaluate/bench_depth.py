@@ -21,6 +21,7 @@ FRAMES = 12
 _MAX_RANGE_M = 6.0
 _EDGE_PX = 7
 _EDGE_STEP_M = 0.3
+_ALL = DepthConfig(drop_mixed=True, bilateral=True, fill_holes=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +63,7 @@ def run(options: BenchOptions) -> BenchReport:
         options.tell(_line(rows[-1]))
     still = _still(options.seed or 0)
     for temporal in (False, True):
-        config = DepthConfig(temporal=temporal)
+        config = _ALL.model_copy(update={"temporal": temporal})
         name = "still camera, pipeline" + (" + temporal" if temporal else "")
         rows.append(measure(name, _pipeline(config), still, warm_up=6))
         options.tell(_line(rows[-1]))
@@ -93,7 +94,7 @@ def methods() -> dict[str, Callable[[], Method]]:
         "mixed pixels dropped": _pipeline(off.model_copy(update={"drop_mixed": True})),
         "holes filled": _pipeline(off.model_copy(update={"fill_holes": True})),
         "bilateral + mixed dropped": _pipeline(off.model_copy(update={"bilateral": True, "drop_mixed": True})),
-        "pipeline": _pipeline(DepthConfig()),
+        "pipeline": _pipeline(_ALL),
     }
 
 

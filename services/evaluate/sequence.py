@@ -43,7 +43,9 @@ def process_sequence(
         source, config, skip_bad_frames=skip_bad_frames,
         progress=None if progress is None else lambda counts: progress(counts, source),
     )  # fmt: skip
-    values = metrics(result)
+    result.stage_ms.update({f"camera.{stage}": ms for stage, ms in sorted(source.stage_ms.items())})
+    result.counters.update({f"camera.{name}": value for name, value in source.watch.counts().items()})
+    values = metrics(result) | {"source_note": source.total()}
     write_files(out, result_files(sequence.resolve().name, result, values))
     return values
 

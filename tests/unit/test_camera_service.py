@@ -12,6 +12,7 @@ from schemas.topics import CAMERA_COMPRESSED, CAMERA_RGBD, SIM_RGBD
 from services.camera import service
 from services.camera.codecs import decode_depth_raw
 from services.camera.config import CameraConfig
+from services.camera.depth.config import DepthConfig
 from services.common.clock import SimulatedClock
 from services.common.config import TreedockConfig
 from services.common.context import Context
@@ -19,6 +20,7 @@ from services.common.errors import InputError
 from services.common.memory import Hub
 from tests.camera_data import PERIOD_NS, depth_image, frame, write_tum
 
+RANGE_ONLY = DepthConfig(drop_mixed=False, bilateral=False, fill_holes=False)
 START_NS = 5_000_000_000
 
 
@@ -50,7 +52,7 @@ def tum(tmp_path: Path, **more: Any) -> CameraConfig:
 
 
 def test_simulated_frames_are_passed_on_range_limited() -> None:
-    rig = Rig(CameraConfig(min_range_m=1.0, max_range_m=5.0))
+    rig = Rig(CameraConfig(min_range_m=1.0, max_range_m=5.0, depth=RANGE_ONLY))
     rig.simulate(frame(4))
     depth = depth_image(4)
     depth[(depth < 5000) | (depth > 25000)] = 0
@@ -66,13 +68,13 @@ def test_a_bad_simulated_frame_is_dropped_counted_and_told_until_all_is_well() -
     assert rig.counters["dropped_bad_frame"] == 1
     assert "dropped" in rig.context.health.notes["frame"]
     for seq in range(30):
-        rig.simulate(frame(seq))
+        rig.simulate(frame(seq, START_NS + seq * PERIOD_NS))
     assert rig.context.health.notes == {}
     assert rig.counters["frames"] == 30
 
 
 def test_compressed_frames_are_sent_only_while_somebody_listens() -> None:
-    rig = Rig(CameraConfig(min_range_m=0.0, max_range_m=13.0), listened=True)
+    rig = Rig(CameraConfig(min_range_m=0.0, max_range_m=13.0, depth=RANGE_ONLY), listened=True)
     rig.simulate(frame(2))
     (packed,) = rig.packed
     assert (packed.colour_encoding, packed.depth_encoding) == ("jpeg", "png")

@@ -16,13 +16,16 @@ from hypothesis import strategies as st
 from schemas.camera import RgbdFrame
 from services.camera.codecs import decode_colour, decode_depth_raw
 from services.camera.config import CameraConfig
+from services.camera.depth.config import DepthConfig
 from services.camera.sources import BadFrame, open_recording, open_source
+from services.camera.sources.associate import associate
 from services.camera.sources.mcap_file import FrameWriter, McapSource
-from services.camera.sources.tum import TumSource, associate
+from services.camera.sources.tum import TumSource
 from services.common.errors import InputError
 from tests.camera_data import CAMERA, colour_image, depth_image, frame, stamp_ns, write_tum
 
 CONFIG = CameraConfig(min_range_m=0.3, max_range_m=7.0)
+RANGE_ONLY = CONFIG.model_copy(update={"depth": DepthConfig(drop_mixed=False, bilateral=False, fill_holes=False)})
 
 
 def frames_of(source: object) -> list[RgbdFrame]:
@@ -33,7 +36,7 @@ def frames_of(source: object) -> list[RgbdFrame]:
 
 @pytest.mark.parametrize("associations", [True, False])
 def test_a_tum_folder_gives_its_frames(tmp_path: Path, associations: bool) -> None:
-    source = TumSource(write_tum(tmp_path / "s", 4, associations=associations), CONFIG)
+    source = open_recording(write_tum(tmp_path / "s", 4, associations=associations), RANGE_ONLY)
     frames = frames_of(source)
     assert source.expected == 4
     assert [f.stamp_ns for f in frames] == [stamp_ns(i) for i in range(4)]
@@ -216,7 +219,7 @@ def write_mcap(path: Path, count: int = 5, **options: Any) -> Path:
 
 
 def test_an_mcap_file_gives_back_its_frames(tmp_path: Path) -> None:
-    source = McapSource(write_mcap(tmp_path / "a.mcap"), CONFIG)
+    source = open_recording(write_mcap(tmp_path / "a.mcap"), RANGE_ONLY)
     frames = frames_of(source)
     assert source.expected == 5
     assert [f.stamp_ns for f in frames] == [stamp_ns(i) for i in range(5)]

@@ -12,6 +12,7 @@ from services.camera.depth.pipeline import DepthPipeline
 
 SHAPE = (48, 64)
 OFF = DepthConfig(drop_mixed=False, bilateral=False, fill_holes=False)
+FULL = DepthConfig(drop_mixed=True, bilateral=True, fill_holes=True)
 SMALL = Intrinsics(width=64, height=48, fx=50.0, fy=50.0, cx=31.5, cy=23.5)
 
 
@@ -32,7 +33,7 @@ def test_range_and_nonsense_become_no_data() -> None:
 
 
 def test_every_stage_can_be_switched_and_is_timed() -> None:
-    pipeline = DepthPipeline(DepthConfig(temporal=True), SHAPE)
+    pipeline = DepthPipeline(FULL.model_copy(update={"temporal": True}), SHAPE)
     assert set(pipeline.process(_step()).stage_ms) == {"range", "mixed", "bilateral", "fill", "temporal"}
     assert set(DepthPipeline(OFF, SHAPE).process(_step()).stage_ms) == {"range"}
 
@@ -40,10 +41,10 @@ def test_every_stage_can_be_switched_and_is_timed() -> None:
 def test_input_is_left_alone_and_wrong_size_is_refused() -> None:
     depth = _step()
     before = depth.copy()
-    _run(depth, DepthConfig())
+    _run(depth, FULL)
     assert np.array_equal(depth, before)
     with pytest.raises(ValueError, match="expected"):
-        DepthPipeline(DepthConfig(), (10, 10)).process(depth)
+        DepthPipeline(FULL, (10, 10)).process(depth)
 
 
 def test_bilateral_denoises_and_keeps_the_edge() -> None:
@@ -141,7 +142,7 @@ def test_undistorted_depth_mixes_no_depths() -> None:
 def test_same_input_same_bytes() -> None:
     rng = np.random.default_rng(3)
     depth = (2.0 + 0.01 * rng.normal(size=SHAPE)).astype(np.float32)
-    assert _run(depth, DepthConfig()).tobytes() == _run(depth, DepthConfig()).tobytes()
+    assert _run(depth, FULL).tobytes() == _run(depth, FULL).tobytes()
 
 
 def test_inverse_and_back() -> None:

@@ -13,20 +13,26 @@ class DepthConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    min_range_m: float = Field(default=0.5, gt=0.0)
-    max_range_m: float = Field(default=6.0, gt=0.0)
+    undistort: bool = False
+    """Resample colour and depth to a camera without lens distortion. Off: slam, mapper and refiner honour the
+    coefficients exactly, point by point, and lose nothing to resampling."""
     sigma_inverse: float = Field(default=0.0020, gt=0.0)
     """Noise of the inverse depth, 1/m: 0.08 px / (565 px * 0.070 m)."""
-    drop_mixed: bool = True
-    bilateral: bool = True
+    drop_mixed: bool = False
+    bilateral: bool = False
     bilateral_diameter_px: int = Field(default=5, ge=3, le=11)
     bilateral_sigma_px: float = Field(default=1.5, gt=0.0)
     bilateral_sigmas: float = Field(default=5.0, gt=0.0)
     """Range weight's standard deviation in units of ``sigma_inverse``."""
-    fill_holes: bool = True
+    fill_holes: bool = False
     fill_reach_px: int = Field(default=4, ge=1, le=16)
     fill_grey_sigma: float = Field(default=12.0, gt=0.0)
     """How much the grey value may differ on one object."""
     temporal: bool = False
     temporal_share: float = Field(default=0.5, gt=0.0, lt=1.0)
     """Weight of the past; given only to pixels that did not change by more than noise."""
+
+    @property
+    def filters(self) -> bool:
+        """Whether any stage beside the range changes the depth image."""
+        return self.drop_mixed or self.bilateral or self.fill_holes or self.temporal

@@ -17,11 +17,12 @@ def register(
 ) -> Image:
     """Return the depth image as the colour camera would see it, (H, W) of that camera, metres, zero without data.
 
-    Distortion of the depth camera is removed; the result is for the colour camera without its distortion (undistort
-    the colour image to match).
+    The depth camera's distortion is removed and the colour camera's is put in (OpenCV's model: Brown 1966): the result
+    fits the colour image as it is.
     """
     x, y = _rays(depth_camera)
-    k = np.array([colour_camera.fx, colour_camera.fy, colour_camera.cx, colour_camera.cy, depth_camera.fx])
+    c = colour_camera
+    k = np.array([c.fx, c.fy, c.cx, c.cy, depth_camera.fx, c.k1, c.k2, c.p1, c.p2, c.k3])
     out = np.empty((colour_camera.height, colour_camera.width), np.float32)
     kernels.splat(depth_m, x, y, T_colour_depth, k, out)
     return out
@@ -41,6 +42,14 @@ def undistort_depth(depth_m: Image, camera: Intrinsics) -> Image:
 
     map_u, map_v = _maps(camera)
     return np.asarray(cv2.remap(depth_m, map_u, map_v, cv2.INTER_NEAREST), dtype=np.float32)
+
+
+def undistort_raw(depth_raw: NDArray[np.uint16], camera: Intrinsics) -> NDArray[np.uint16]:
+    """As ``undistort_depth``, in raw units."""
+    import cv2
+
+    map_u, map_v = _maps(camera)
+    return np.asarray(cv2.remap(depth_raw, map_u, map_v, cv2.INTER_NEAREST), dtype=np.uint16)
 
 
 @lru_cache(maxsize=4)

@@ -152,8 +152,8 @@ def splat(
 ) -> None:
     """Register depth to another camera: move each pixel's point by ``T`` (4, 4) and draw it, the nearest wins.
 
-    ``k``: fx fy cx cy of the target, its width and height are ``out``'s, and the source's focal length: a pixel is
-    drawn with the size it has in the target, so that a finer target image has no gaps.
+    ``k``: fx fy cx cy of the target (its width and height are ``out``'s), the source's focal length, and the target's
+    k1 k2 p1 p2 k3. A pixel is drawn with the size it has in the target, so that a finer target image has no gaps.
     """
     height, width = out.shape
     out[:] = 0.0
@@ -166,8 +166,12 @@ def splat(
             zt = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
             if not zt > 0.05:
                 continue
-            ut = k[0] * (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / zt + k[2]
-            vt = k[1] * (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / zt + k[3]
+            xt = (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / zt
+            yt = (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / zt
+            r2 = xt * xt + yt * yt
+            radial = 1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[9]))
+            ut = k[0] * (xt * radial + 2.0 * k[7] * xt * yt + k[8] * (r2 + 2.0 * xt * xt)) + k[2]
+            vt = k[1] * (yt * radial + k[7] * (r2 + 2.0 * yt * yt) + 2.0 * k[8] * xt * yt) + k[3]
             half_u, half_v = 0.5 * k[0] / k[4] * z / zt, 0.5 * k[1] / k[4] * z / zt
             first_u, last_u = max(math.ceil(ut - half_u), 0), min(math.floor(ut + half_u), width - 1)
             first_v, last_v = max(math.ceil(vt - half_v), 0), min(math.floor(vt + half_v), height - 1)

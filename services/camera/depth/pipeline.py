@@ -29,8 +29,11 @@ class Processed:
 class DepthPipeline:
     """Keeps its buffers and the temporal filter's past; one per camera."""
 
-    def __init__(self, config: DepthConfig, shape: tuple[int, int]) -> None:
+    def __init__(
+        self, config: DepthConfig, shape: tuple[int, int], min_range_m: float = 0.5, max_range_m: float = 6.0
+    ) -> None:
         self._config = config
+        self._range_m = (min_range_m, max_range_m)
         self._shape = shape
         self._a, self._b = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         self._past = np.zeros(shape, np.float32)
@@ -50,7 +53,7 @@ class DepthPipeline:
             raise ValueError(f"depth image of shape {depth_m.shape}, expected {self._shape}, grey image the same")
         stage_ms: dict[str, float] = {}
         begin = time.perf_counter()
-        kernels.to_inverse(depth_m, self._config.min_range_m, self._config.max_range_m, self._a)
+        kernels.to_inverse(depth_m, self._range_m[0], self._range_m[1], self._a)
         begin = _lap(stage_ms, "range", begin)
         for name, stage in self._stages(grey):
             stage(self._a, self._b)
@@ -105,7 +108,7 @@ def _lap(stage_ms: dict[str, float], name: str, begin: float) -> float:
 
 def warm() -> None:
     """Compile or load every kernel."""
-    config = DepthConfig(temporal=True)
+    config = DepthConfig(drop_mixed=True, bilateral=True, fill_holes=True, temporal=True)
     DepthPipeline(config, (16, 16)).process(np.ones((16, 16), np.float32), np.zeros((16, 16), np.uint8))
     flat = np.zeros((4, 4), np.float32)
-    kernels.splat(flat, flat, flat, np.eye(4), np.ones(5), flat.copy())
+    kernels.splat(flat, flat, flat, np.eye(4), np.ones(10), flat.copy())

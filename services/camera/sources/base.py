@@ -19,7 +19,7 @@ class BadFrame:
 
 
 class Source(Protocol):
-    """Frames in the order of their stamps, uncompressed, range limited; a bad one comes as a BadFrame.
+    """Frames in the order in which they came, uncompressed; a bad one comes as a BadFrame.
 
     Opening a source raises InputError when it cannot be used at all; iterating does not raise for bad data.
     """

@@ -14,7 +14,6 @@ from schemas.envelope import DecodeError
 from schemas.topics import CAMERA_COMPRESSED, CAMERA_RGBD, Topic
 from services.camera.codecs import FrameError, raw, recode
 from services.camera.config import CameraConfig
-from services.camera.ranging import limit_frame
 from services.camera.sources.accelerometer import telling
 from services.camera.sources.base import BadFrame
 from services.common.errors import InputError
@@ -86,7 +85,6 @@ class McapSource:
             raise InputError(f"{config.camera_file}: not used: {path} carries its own intrinsics; leave --camera out")
         self.name = str(path)
         self._path = path
-        self._config = config
         self._topic, self.expected = _frame_topic(path)
 
     def __iter__(self) -> Iterator[RgbdFrame | BadFrame]:
@@ -106,8 +104,7 @@ class McapSource:
     def _frame(self, log_time_ns: int, data: bytes, number: int) -> RgbdFrame | BadFrame:
         try:
             frame = raw(RgbdFrame.from_bytes(data))
-            frame = dataclasses.replace(frame, accel_camera=telling(frame.accel_camera))
-            return limit_frame(frame, self._config.min_range_m, self._config.max_range_m)
+            return dataclasses.replace(frame, accel_camera=telling(frame.accel_camera))
         except (DecodeError, FrameError) as error:
             return BadFrame(log_time_ns, f"{self._path}: message {number}: {error}")
 

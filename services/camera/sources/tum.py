@@ -12,15 +12,15 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.camera import Intrinsics, RgbdFrame
 from services.camera.codecs import FrameError, decode_colour_image, decode_depth_image, encode_colour, encode_depth
 from services.camera.config import CameraConfig
-from services.camera.ranging import limit_range
 from services.camera.sources.accelerometer import Accelerometer
+from services.camera.sources.associate import associate, unpaired
 from services.camera.sources.base import BadFrame
 from services.camera.sources.camera_json import read_intrinsics
+from services.camera.sources.registration import registration_for
 from services.camera.sources.text import read_rows, stamp_ns_of
 from services.common.errors import InputError
 
@@ -39,34 +39,6 @@ class Pair:
     depth: Path
 
 
-def associate(colour_ns: NDArray[np.int64], depth_ns: NDArray[np.int64], within_ns: int) -> list[tuple[int, int]]:
-    """Pair colour and depth stamps: nearest first, each used once, none further apart than ``within_ns``.
-
-    Args:
-        colour_ns: (N,) stamps, any order.
-        depth_ns: (M,) stamps, any order.
-        within_ns: the largest difference.
-
-    Returns:
-        Index pairs (colour, depth) in the order of the colour stamps.
-    """
-    order = np.argsort(depth_ns, kind="stable")
-    ordered = depth_ns[order]
-    candidates = []
-    for i, stamp in enumerate(colour_ns):
-        first, last = np.searchsorted(ordered, [stamp - within_ns, stamp + within_ns + 1])
-        candidates += [(abs(int(ordered[k]) - int(stamp)), int(stamp), i, int(order[k])) for k in range(first, last)]
-    used_colour: set[int] = set()
-    used_depth: set[int] = set()
-    pairs = []
-    for _, stamp, i, k in sorted(candidates):
-        if i not in used_colour and k not in used_depth:
-            used_colour.add(i)
-            used_depth.add(k)
-            pairs.append((stamp, i, k))
-    return [(i, k) for _, i, k in sorted(pairs)]
-
-
 class TumSource:
     """Frames of one TUM RGB-D folder."""
 
@@ -76,12 +48,12 @@ class TumSource:
         if not folder.is_dir():
             raise InputError(f"{folder}: no such folder")
         self.name = str(folder)
-        self._config = config
         self._pairs = _pairs(folder, config)
         self.expected: int | None = len(self._pairs)
         self.intrinsics: Intrinsics = read_intrinsics(
             Path(config.camera_file) if config.camera_file else folder / "camera.json"
         )
+        self._registration = registration_for(config, self.intrinsics)
         accelerometer = folder / "accelerometer.txt"
         self._accelerometer = Accelerometer.from_file(accelerometer) if accelerometer.exists() else None
 
@@ -96,14 +68,15 @@ class TumSource:
             before_ns = pair.stamp_ns
 
     def _load(self, pair: Pair, seq: int, before_ns: int) -> RgbdFrame:
-        camera, config = self.intrinsics, self._config
+        camera, registration = self.intrinsics, self._registration
         colour = _decoded(pair.colour, decode_colour_image, camera)
-        depth = _decoded(pair.depth, decode_depth_image, camera)
-        limited = limit_range(depth, camera.depth_scale, config.min_range_m, config.max_range_m)
+        depth = _decoded(pair.depth, decode_depth_image, registration.camera if registration else camera)
+        if registration is not None:
+            depth = registration.apply(depth)
         accel = self._accelerometer.mean_between(before_ns, pair.stamp_ns) if self._accelerometer else None
         return RgbdFrame(
             stamp_ns=pair.stamp_ns, seq=seq, intrinsics=camera, colour=encode_colour(colour, "bgr8"),
-            depth=encode_depth(limited, "z16"), accel_camera=accel,
+            depth=encode_depth(depth, "z16"), accel_camera=accel,
         )  # fmt: skip
 
 
@@ -131,7 +104,7 @@ def _pairs(folder: Path, config: CameraConfig) -> list[Pair]:
     else:
         pairs = _associated(folder, config)
     if not pairs:
-        raise InputError(f"{folder}: no frames: its lists name no colour image with a depth image near it in time")
+        raise InputError(f"{listed}: no frames: it lists none")
     pairs.sort(key=lambda pair: pair.stamp_ns)
     for before, after in itertools.pairwise(pairs):
         if before.stamp_ns == after.stamp_ns:
@@ -151,5 +124,8 @@ def _associated(folder: Path, config: CameraConfig) -> list[Pair]:
         np.array([stamp_ns_of(row, 0, path) for row in rows], dtype=np.int64)
         for path, rows in zip(lists, (colour, depth), strict=True)
     )
-    matches = associate(colour_ns, depth_ns, round(config.associate_within_s * 1e9))
+    within_ns = round(config.associate_within_s * 1e9)
+    matches = associate(colour_ns, depth_ns, within_ns)
+    if not matches:
+        raise InputError(f"{folder}: no frames: {unpaired(colour_ns, depth_ns, within_ns)}")
     return [Pair(int(colour_ns[i]), folder / colour[i].fields[1], folder / depth[k].fields[1]) for i, k in matches]
