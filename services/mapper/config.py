@@ -32,7 +32,9 @@ class MapperConfig(BaseModel):
     nearer: float = Field(default=0.7, gt=0.0, le=1.0)
     """A full voxel still takes a point that was seen from less than this share of the range of those in it."""
     max_points: int = Field(default=3_000_000, gt=0)
-    """Memory bound of the whole map (about 20 bytes a point); beyond it the oldest submaps are thinned."""
+    """Memory bound of the whole map (about 60 bytes a point); beyond it the oldest submaps are thinned."""
+    rekey_m: float = Field(default=0.02, gt=0.0)
+    """A submap that the graph moved further gives its voxels back and takes those of its new place."""
     move_m: float = Field(default=0.001, gt=0.0)
     move_rad: float = Field(default=0.0005, gt=0.0)
     """A submap that the graph moved by less is not sent again."""

@@ -81,9 +81,11 @@ class MapperService:
         self._graph_version = graph.version
         self._poses = {node.keyframe_id: from_transform(node.T_map_camera) for node in graph.nodes}
         with self._context.health.timed("move"):
-            moved = self.map.move(self._poses)
-        for submap in moved:
+            moves = self.map.move(self._poses)
+        for submap in moves.moved:
             self._publish(submap, points=False)
+        for submap in moves.thinned:
+            self._publish(submap, points=True)
 
     def whole_map(self) -> list[Wire]:
         """Return every submap with its points."""
