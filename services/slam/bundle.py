@@ -11,8 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from services.slam.atlas import Keyframes, Points
 from services.slam.linear import cholesky_solve, step_pose
+from services.slam.links import Keyframes, Points
 from services.slam.observe import (
     CHI2_DEPTH,
     CHI2_MONO,

@@ -8,11 +8,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from services.slam.atlas import Atlas, Keyframes, Points, describe, merge, neighbours, observe, points_of, shared_counts
+from services.slam.atlas import Atlas, neighbours
 from services.slam.binary import match_all
 from services.slam.camera import CameraModel
 from services.slam.config import SlamConfig
 from services.slam.features import Features
+from services.slam.links import Keyframes, Points, describe, merge, observe, points_of, shared_counts
 from services.slam.mapping import Mapping
 from services.slam.match import keep_common_turn
 from services.slam.places import Bag, Places

@@ -7,25 +7,24 @@ from numba import njit
 from numpy.typing import NDArray
 
 from services.common.geometry import inverse, pose
-from services.slam.atlas import (
-    Atlas,
+from services.slam.atlas import Atlas, neighbours
+from services.slam.bundle import adjust, adjust_large, build, chi_squares
+from services.slam.camera import CameraModel
+from services.slam.config import SlamConfig
+from services.slam.features import Features
+from services.slam.links import (
     Keyframes,
     Points,
     create_points,
     describe,
     forget,
     merge,
-    neighbours,
     observe,
     points_of,
     remove_keyframe,
     remove_point,
     shared_counts,
 )
-from services.slam.bundle import adjust, adjust_large, build, chi_squares
-from services.slam.camera import CameraModel
-from services.slam.config import SlamConfig
-from services.slam.features import Features
 from services.slam.match import match_windows, project
 from services.slam.observe import CHI2_DEPTH, CHI2_MONO
 from services.slam.refine import gate

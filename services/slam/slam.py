@@ -15,10 +15,11 @@ from schemas.camera import Intrinsics
 from schemas.slam import GraphReason, SlamStatus
 from services.common.geometry import inverse, orthonormal, pose
 from services.slam import gravity, vocabulary
-from services.slam.atlas import Atlas, shared_counts
+from services.slam.atlas import Atlas
 from services.slam.camera import camera_model
 from services.slam.config import SlamConfig
 from services.slam.features import Extractor, Features
+from services.slam.links import shared_counts
 from services.slam.loops import Loops
 from services.slam.mapping import Mapping
 from services.slam.places import Places

@@ -8,12 +8,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from services.slam.atlas import Atlas, Keyframes, Points, neighbours, points_of, shared_counts
+from services.slam.atlas import Atlas, neighbours
 from services.slam.binary import match_all
 from services.slam.camera import CameraModel
 from services.slam.config import SlamConfig
 from services.slam.features import Features
 from services.slam.linear import log_so3, matmul3
+from services.slam.links import Keyframes, Points, points_of, shared_counts
 from services.slam.match import keep_common_turn, match_windows, project
 from services.slam.refine import refine_pose
 
