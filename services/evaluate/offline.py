@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from schemas.camera import RgbdFrame
 from schemas.slam import Pose
-from schemas.topics import CAMERA_RGBD, SLAM_POSE, TREES_TARGET
+from schemas.topics import CAMERA_RGBD, SLAM_POSE, TREES_TARGET, VEHICLE_STATE
 from schemas.trees import Target, Tree
+from schemas.vehicle import VehicleState
 from services.camera.sources.base import BadFrame
 from services.common.clock import SimulatedClock
 from services.common.config import TreedockConfig
@@ -95,7 +96,7 @@ class Chain:
         # mypy: the protocol's clock is writable, so it wants exactly Clock
         self._services = {name: build(cast("Context", self._contexts[name])) for name, build in builders.items()}
         self._setup_s = time.perf_counter() - self._begin_s
-        self._camera = self._hub.context("camera")
+        self._camera, self._autopilot = self._hub.context("camera"), self._hub.context("autopilot")
         self._frame_ms: list[float] = []
         self._online: list[Stamped] = []
         self._targets: list[Target] = []
@@ -112,6 +113,11 @@ class Chain:
         self._hub.run()
         self._frame_ms.append((time.perf_counter() - begin) * 1e3)
         self.counts.frames += 1
+
+    def hear(self, state: VehicleState) -> None:
+        """Take what the autopilot said."""
+        self._autopilot.publish(VEHICLE_STATE, state)
+        self._hub.run()
 
     def result(self) -> OfflineResult:
         """Let the chain come to rest and collect the final estimates; a service left out contributes nothing."""
@@ -160,6 +166,7 @@ def run_offline(
     config: TreedockConfig,
     *,
     builders: Mapping[str, Builder] | None = None,
+    companions: Iterable[VehicleState] = (),
     skip_bad_frames: bool = False,
     progress: Callable[[Counts], None] | None = None,
 ) -> OfflineResult:
@@ -169,6 +176,7 @@ def run_offline(
         frames: a source; stamps must rise.
         config: of every service.
         builders: the services by name (slam, mapper, detector, refiner, or some of them); by default the real ones.
+        companions: what the autopilot said meanwhile, in order of time; each is heard before the first frame after it.
         skip_bad_frames: go on past frames that cannot be used, and count them.
         progress: called after each frame with the counts so far.
 
@@ -184,7 +192,12 @@ def run_offline(
         )
     chain = Chain(config, builders, first.stamp_ns)
     chain.counts.skipped = skipped
+    heard = iter(companions)
+    waiting = next(heard, None)
     for frame in itertools.chain([first], good):
+        while waiting is not None and waiting.stamp_ns <= frame.stamp_ns:
+            chain.hear(waiting)
+            waiting = next(heard, None)
         chain.feed(frame)
         if progress is not None:
             progress(chain.counts)

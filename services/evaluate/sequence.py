@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from schemas.topics import VEHICLE_STATE
+from schemas.vehicle import VehicleState
 from services.camera.sources import Source, open_recording
 from services.evaluate import exports
 from services.evaluate.atomic import prepare, write_files
@@ -40,7 +42,7 @@ def process_sequence(
     source = open_recording(sequence, settings)
     _single_threaded()
     result = run_offline(
-        source, config, skip_bad_frames=skip_bad_frames,
+        source, config, companions=_vehicle_states(sequence), skip_bad_frames=skip_bad_frames,
         progress=None if progress is None else lambda counts: progress(counts, source),
     )  # fmt: skip
     result.stage_ms.update({f"camera.{stage}": ms for stage, ms in sorted(source.stage_ms.items())})
@@ -48,6 +50,17 @@ def process_sequence(
     values = metrics(result) | {"source_note": source.total()}
     write_files(out, result_files(sequence.resolve().name, result, values))
     return values
+
+
+def _vehicle_states(sequence: Path) -> Iterator[VehicleState]:
+    """Yield what the autopilot said while an MCAP recording was made; slam levels its map by it as in the flight."""
+    from services.recorder.reader import Recorded, messages
+
+    if sequence.is_dir():
+        return
+    for entry in messages(sequence, (VEHICLE_STATE,)):
+        if isinstance(entry, Recorded) and isinstance(entry.message, VehicleState):
+            yield entry.message
 
 
 def result_files(title: str, result: OfflineResult, values: dict[str, Any]) -> dict[str, bytes]:

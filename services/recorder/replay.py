@@ -1,0 +1,113 @@
+"""Plays a recording onto the bus: each message when it is due, stamps moved to now."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from schemas.camera import RgbdFrame
+from schemas.codec import Wire
+from schemas.topics import CAMERA_COMPRESSED, CAMERA_RGBD, TOPICS, VEHICLE_STATE, Topic
+from services.common.errors import InputError
+from services.recorder.reader import Recorded, messages
+
+if TYPE_CHECKING:
+    from services.common.bus import Bus
+    from services.common.config import TreedockConfig
+    from services.common.stop import StopSignal
+
+SENSORS: tuple[Topic, ...] = (CAMERA_RGBD, CAMERA_COMPRESSED, VEHICLE_STATE)
+"""What services are fed with; all else they make themselves."""
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Which part, and how fast."""
+
+    begin_s: float = 0.0
+    end_s: float | None = None
+    rate: float = 1.0
+
+
+@dataclass(slots=True)
+class Played:
+    """What a replay did."""
+
+    sent: int = 0
+    seconds: float = 0.0
+    faults: list[str] = field(default_factory=list)
+
+
+def check(span: Span) -> None:
+    """Refuse a span that holds nothing.
+
+    Raises:
+        InputError: it ends before it begins.
+    """
+    if span.end_s is not None and span.end_s <= span.begin_s:
+        raise InputError(f"--to {span.end_s:g} s is not after --from {span.begin_s:g} s")
+
+
+def play(config: TreedockConfig, file: Path, span: Span, *, everything: bool = False) -> Played:
+    """Play a file onto the configured bus until its end or a stop signal.
+
+    Raises:
+        InputError: the file cannot be used, or no router answers.
+    """
+    from services.common.bus import Bus
+    from services.common.context import HealthBook
+    from services.common.session import opened_node
+    from services.common.stop import StopSignal
+
+    stop = StopSignal()
+    stop.install()
+    entries = messages(file, TOPICS if everything else SENSORS)
+    first = next((entry for entry in entries if isinstance(entry, Recorded)), None)
+    if first is None:
+        raise InputError(f"{file}: it holds nothing to replay; `treedock recordings` shows what is in a file")
+    with opened_node(config, "camera", lambda: stop.is_set, wait_s=0.0) as session:
+        bus = Bus(session, config.uav, HealthBook())
+        return _play(bus, itertools.chain([first], entries), first.stamp_ns, span, stop)
+
+
+def _play(bus: Bus, entries: itertools.chain[Recorded | str], first_ns: int, span: Span, stop: StopSignal) -> Played:
+    played, begin_s = Played(), time.monotonic()
+    # the moment of now at which the recording's start would lie: added to every stamp of the recording
+    moved_ns = time.time_ns() - first_ns - round(span.begin_s * 1e9)
+    for entry in entries:
+        if isinstance(entry, str):
+            played.faults.append(entry)
+            continue
+        at_s = 1e-9 * (entry.stamp_ns - first_ns)
+        if at_s < span.begin_s:
+            continue
+        if stop.is_set or (span.end_s is not None and at_s > span.end_s):
+            break
+        due_s = begin_s + (at_s - span.begin_s) / span.rate
+        if (wait_s := due_s - time.monotonic()) > 0 and stop.wait(wait_s):
+            break
+        topic, message = _to_send(entry, moved_ns, at_s - span.begin_s, span.rate)
+        bus.publish(topic, message, entry.leaf)
+        played.sent += 1
+    played.seconds = time.monotonic() - begin_s
+    return played
+
+
+def _to_send(entry: Recorded, moved_ns: int, into_s: float, rate: float) -> tuple[Topic, Wire]:
+    """Return the topic and the message with its stamp in the present: old stamps would count as stale data."""
+    # faster or slower, the stamps keep the recorded intervals' ratio to the wall clock
+    shift_ns = moved_ns + round(into_s * 1e9 * (1.0 / rate - 1.0))
+    message = entry.message
+    if isinstance(message, RgbdFrame):
+        from services.camera.codecs import raw
+
+        message = raw(dataclasses.replace(message, stamp_ns=message.stamp_ns + shift_ns))
+        return CAMERA_RGBD, message
+    stamp_ns = getattr(message, "stamp_ns", None)
+    if isinstance(stamp_ns, int) and hasattr(message, "model_copy"):
+        message = message.model_copy(update={"stamp_ns": stamp_ns + shift_ns})
+    return entry.topic, message

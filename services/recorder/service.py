@@ -1,0 +1,117 @@
+"""The recorder as a process: everything that the topics table marks as recorded, into MCAP files."""
+
+from __future__ import annotations
+
+import datetime as dt
+import logging
+import os
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+
+from schemas.camera import RgbdFrame
+from schemas.codec import Wire, encode
+from schemas.health import Health
+from schemas.topics import CAMERA_COMPRESSED, CAMERA_RGBD, TOPICS, Delivery, Topic
+from services.common.context import Context
+from services.common.errors import InputError
+from services.common.files import make_folder
+from services.recorder.config import RecorderConfig
+from services.recorder.drain import Drain, Entry, Limits
+from services.recorder.foxglove import Translator
+from services.recorder.mcap_file import McapFile
+from services.recorder.recover import recover_folder
+
+LOG = logging.getLogger(__name__)
+
+_MB = 1_000_000
+_TELL_S = 1.0
+
+
+def build(context: Context) -> RecorderService:
+    """Mend what an earlier recorder left cut, open a file and register the work.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    config = context.config.recorder
+    make_folder(config.folder)
+    for mended in recover_folder(config.folder):
+        LOG.info("%s", mended)
+    service = RecorderService(context, config)
+    for topic in recorded_topics(config):
+        context.on(topic, partial(service.take, topic), "*" if topic.name.endswith("*") else None)
+    context.every_wall(_TELL_S, service.tell)
+    context.on_stop(service.stop)
+    return service
+
+
+def recorded_topics(config: RecorderConfig) -> list[Topic]:
+    """Return what goes into the file."""
+    frames = {"compressed": CAMERA_COMPRESSED, "raw": CAMERA_RGBD}.get(config.frames)
+    left_out = {CAMERA_RGBD, CAMERA_COMPRESSED} - {frames}
+    return [t for t in TOPICS if t.recorded and t.delivery is not Delivery.QUERY and t not in left_out]
+
+
+class RecorderService:
+    """Encodes messages and hands them to the drain; the disk is the drain's."""
+
+    def __init__(self, context: Context, config: RecorderConfig) -> None:
+        self._context = context
+        self._config = config
+        self._files = 0
+        self._translator = Translator(context.uav, config.foxglove_image_hz) if config.foxglove else None
+        limits = Limits(config.flush_s, config.file_mb * _MB, config.queue_mb * _MB, config.reserve_mb * _MB)
+        self._begun = dt.datetime.now(dt.UTC)
+        self.drain = Drain(self._open_file, limits, lambda: _free_bytes(config.folder))
+        self._told: dict[str, int] = {}
+
+    def take(self, topic: Topic, message: Wire) -> None:
+        """Queue one message, and what Foxglove shows of it."""
+        with self._context.health.timed("take"):
+            stamp_ns = self._context.clock.now_ns()
+            heavy = isinstance(message, RgbdFrame)
+            key = topic.key(self._context.uav, message.service if isinstance(message, Health) else None)
+            data = bytes(encode(message))
+            seq = getattr(message, "seq", 0)
+            self.drain.put(
+                Entry(key, getattr(topic.message, "SCHEMA", topic.name), topic.encoding, data, stamp_ns, seq, heavy)
+            )
+            if self._translator is not None:
+                for name, shown in self._translator.translate(message):
+                    self.drain.put(Entry(name, "", "", shown, stamp_ns, 0, heavy))
+
+    def tell(self) -> None:
+        """Bring the drain's counters and its trouble into health."""
+        health = self._context.health
+        for name, value in sorted(self.drain.counters.items()):
+            health.count(name, value - self._told.get(name, 0))
+            self._told[name] = value
+        health.note("disk", self.drain.trouble)
+
+    def stop(self) -> None:
+        """Complete the file."""
+        self.drain.close()
+
+    def _open_file(self) -> McapFile:
+        for _ in range(1000):
+            self._files += 1
+            name = f"{self._context.uav}-{self._begun:%Y%m%dT%H%M%SZ}-{self._files:03d}.mcap"
+            path = self._config.folder / name
+            if not path.exists():
+                LOG.info("recording to %s", path)
+                return McapFile(path, self._about())
+        raise InputError(f"{self._config.folder}: holds a thousand files of this very second; empty it")
+
+    def _about(self) -> dict[str, str]:
+        return {
+            "uav": self._context.uav,
+            "version": version("treedock"),
+            "begun_utc": f"{self._begun:%Y-%m-%dT%H:%M:%SZ}",
+            "config": self._context.config.model_dump_json(),
+        }
+
+
+def _free_bytes(folder: Path) -> int:
+    status = os.statvfs(folder)
+    return status.f_bavail * status.f_frsize
