@@ -1,15 +1,16 @@
-"""The dense map as deltas: one binary message per submap, placed by its own pose."""
+"""The dense map as deltas: one binary message per submap, placed by its own pose; what it holds; the ground under it."""
 
 from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Annotated, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
-from schemas.envelope import DecodeError
+from schemas.envelope import Counter, DecodeError, Message, Name, Part, StampNs
 
 
 @dataclass(frozen=True)
@@ -119,3 +120,71 @@ class Submap:
 
 _MAGIC = b"TDSM"
 _HEADER = struct.Struct("<4sBBHQQQq12dIII")
+
+
+Cell = Annotated[int, Field(ge=-(2**31), lt=2**31)]
+
+
+class MapIndex(Message):
+    """What the mapper holds: a consumer that holds anything else has missed a delta and asks ``map/cloud`` for the whole.
+
+    The three lists run side by side, one entry for each submap that has points.
+    """
+
+    SCHEMA: ClassVar[str] = "treedock.map_index"
+    MAX_BYTES: ClassVar[int] = 1024 * 1024
+
+    stamp_ns: StampNs
+    map_id: Name
+    epoch: Counter
+    """Names this run of the mapper: versions of another run say nothing about the points of this one."""
+    graph_version: Counter
+    submap_ids: Annotated[tuple[Counter, ...], Field(max_length=20_000)]
+    versions: Annotated[tuple[Counter, ...], Field(max_length=20_000)]
+    """Of each submap's points."""
+    placed_by: Annotated[tuple[Counter, ...], Field(max_length=20_000)]
+    """Version of the graph under which each submap was last sent: an older place is out of date."""
+    ground_sequence: Counter = 0
+    """Of the last ``map/ground``."""
+
+    @model_validator(mode="after")
+    def _side_by_side(self) -> Self:
+        if not len(self.submap_ids) == len(self.versions) == len(self.placed_by):
+            raise ValueError(
+                f"{len(self.submap_ids)} submaps, {len(self.versions)} versions and {len(self.placed_by)} places: one of each was expected"
+            )
+        return self
+
+
+class GroundCell(Part):
+    """The ground in one square cell of the map: ``z = height + slope_x (x - xc) + slope_y (y - yc)``, (xc, yc) its centre."""
+
+    column: Cell
+    """The cell covers ``column * cell_m <= x < (column + 1) * cell_m``, ``row`` the same along y."""
+    row: Cell
+    height_m: float
+    """z of the ground at the cell's centre."""
+    slope_x: float
+    slope_y: float
+    """Metres up per metre along x and y."""
+    relief_m: Annotated[float, Field(ge=0.0)]
+    """Roughness: half the width that holds the middle 68 % of the ground points about the plane."""
+    points: Annotated[int, Field(ge=0)]
+    """Ground points that the plane rests on; 0: none in this cell, it is what the neighbours say."""
+
+
+class GroundPatch(Message):
+    """Cells of the ground model that changed, in ``map``; each replaces what was said of it before."""
+
+    SCHEMA: ClassVar[str] = "treedock.ground"
+    MAX_BYTES: ClassVar[int] = 4 * 1024 * 1024
+
+    stamp_ns: StampNs
+    map_id: Name
+    graph_version: Counter
+    sequence: Counter
+    """One more with each patch: after a gap ask ``map/ground`` for the whole."""
+    cell_m: Annotated[float, Field(gt=0.0)]
+    cells: Annotated[tuple[GroundCell, ...], Field(max_length=20_000)]
+    gone: Annotated[tuple[tuple[Cell, Cell], ...], Field(max_length=20_000)] = ()
+    """(column, row) of cells that have no ground any more."""

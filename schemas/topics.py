@@ -14,8 +14,9 @@ from schemas.codec import Wire
 from schemas.command import Command, NonceRequest
 from schemas.envelope import Message
 from schemas.health import Health
-from schemas.mapping import Submap
+from schemas.mapping import GroundPatch, MapIndex, Submap
 from schemas.navigation import Guidance, MissionState
+from schemas.preview import PreviewImage
 from schemas.simulation import SimClock, SimTruth
 from schemas.slam import Graph, Keyframe, Pose
 from schemas.trees import Target, TreeList
@@ -93,11 +94,11 @@ _LATEST, _STREAM, _ADVANCED, _QUERY = Delivery.LATEST, Delivery.STREAM, Delivery
 ANY = "*"
 """Every service (health, liveness)."""
 
-CAMERA_RGBD = Topic("camera/rgbd", RgbdFrame, "camera", ("slam", "refiner", "navigator"), 15, 1.0, _H, _LATEST, "data",
+CAMERA_RGBD = Topic("camera/rgbd", RgbdFrame, "camera", ("slam", "refiner", "navigator", "preview"), 15, 1.0, _H, _LATEST, "data",
                     description="colour and registered depth, raw")  # fmt: skip
 CAMERA_COMPRESSED = Topic("camera/rgbd_compressed", RgbdFrame, "camera", ("recorder",), 0, None, _A, _LATEST, "data_low",
                           description="the same as JPEG and PNG, sent only while somebody listens")  # fmt: skip
-SLAM_POSE = Topic("slam/pose", Pose, "slam", ("refiner", "navigator", "autopilot", "simulator", "station"), 15, 0.5, _R, _STREAM,
+SLAM_POSE = Topic("slam/pose", Pose, "slam", ("refiner", "navigator", "autopilot", "simulator", "station", "preview"), 15, 0.5, _R, _STREAM,
                   "interactive_high", radio_hz=5, express=True, description="camera in map for each frame, with covariance")  # fmt: skip
 SLAM_KEYFRAME = Topic("slam/keyframe", Keyframe, "slam", ("mapper",), 0, None, _A, _ADVANCED, "data", cache=64,
                       description="keyframe with compressed depth")  # fmt: skip
@@ -105,13 +106,17 @@ SLAM_GRAPH = Topic("slam/graph", Graph, "slam", ("mapper",), 0, None, _A, _ADVAN
                    description="all keyframe poses after a correction")  # fmt: skip
 MAP_CLOUD = Topic("map/cloud", Submap, "mapper", ("detector",), 0, None, _A, _STREAM, "data_low",
                   description="submaps as they change; a queryable answers with the whole map")  # fmt: skip
-TREES_LIST = Topic("trees/list", TreeList, "detector", ("refiner", "navigator", "station"), 0, None, _R, _ADVANCED, "data_high",
+MAP_INDEX = Topic("map/index", MapIndex, "mapper", ("detector",), 0, None, _A, _LATEST, "data_low",
+                  description="what the map holds: who holds less has missed a delta")  # fmt: skip
+MAP_GROUND = Topic("map/ground", GroundPatch, "mapper", ("recorder",), 0, None, _A, _STREAM, "data_low",
+                   description="ground per cell as it changes: height, slope, relief; a queryable answers with the whole")  # fmt: skip
+TREES_LIST = Topic("trees/list", TreeList, "detector", ("refiner", "navigator", "station", "preview"), 0, None, _R, _ADVANCED, "data_high",
                    description="all trees known; a queryable answers with the latest")  # fmt: skip
-TREES_TARGET = Topic("trees/target", Target, "refiner", ("navigator", "simulator", "station"), 15, 0.5, _R, _STREAM,
+TREES_TARGET = Topic("trees/target", Target, "refiner", ("navigator", "simulator", "station", "preview"), 15, 0.5, _R, _STREAM,
                      "interactive_high", radio_hz=5, express=True, description="the target trunk in the depth image")  # fmt: skip
-MISSION_STATE = Topic("mission/state", MissionState, "navigator", ("refiner", "autopilot", "station"), 5, 1.0, _R, _STREAM,
+MISSION_STATE = Topic("mission/state", MissionState, "navigator", ("refiner", "autopilot", "station", "preview"), 5, 1.0, _R, _STREAM,
                       "interactive_high", radio_hz=5, express=True, description="the mission's state, its reason, the target")  # fmt: skip
-MISSION_GUIDANCE = Topic("mission/guidance", Guidance, "navigator", ("autopilot", "simulator"), 20, 0.3, _A, _STREAM,
+MISSION_GUIDANCE = Topic("mission/guidance", Guidance, "navigator", ("autopilot", "simulator", "preview"), 20, 0.3, _A, _STREAM,
                          "interactive_high", express=True, description="one of eight commands with its setpoint")  # fmt: skip
 VEHICLE_STATE = Topic("vehicle/state", VehicleState, "autopilot", ("navigator", "slam", "simulator", "station"), 20, 0.5, _R, _STREAM,
                       "interactive_high", radio_hz=5, express=True, description="mode, arming, attitude, battery")  # fmt: skip
@@ -119,6 +124,8 @@ COMMAND = Topic("cmd/*", Command, "station", ("navigator",), 0, None, _R, _QUERY
                 description="start hold resume abort land choose next: the reply says accepted or why not")  # fmt: skip
 COMMAND_NONCE = Topic("nonce", NonceRequest, "station", ("navigator",), 0, None, _R, _QUERY, "real_time", express=True,
                       recorded=False, description="ask the aircraft for a nonce to command with")  # fmt: skip
+PREVIEW_IMAGE = Topic("preview/image", PreviewImage, "preview", ("station",), 5, None, _R, _LATEST, "background",
+                      recorded=False, description="small picture with the overlay, sent only while somebody looks")  # fmt: skip
 HEALTH = Topic("health/*", Health, ANY, ("station",), 1, 3.0, _R, _STREAM, "data_high",
                description="each service's own account of itself")  # fmt: skip
 SIM_RGBD = Topic("sim/rgbd", RgbdFrame, "simulator", ("camera",), 15, None, _H, _LATEST, recorded=False,
@@ -129,8 +136,8 @@ SIM_TRUTH = Topic("sim/truth", SimTruth, "simulator", ("evaluate",), 15, None, _
                   description="true pose and trees: benchmarks and summaries only")  # fmt: skip
 
 TOPICS: tuple[Topic, ...] = (
-    CAMERA_RGBD, CAMERA_COMPRESSED, SLAM_POSE, SLAM_KEYFRAME, SLAM_GRAPH, MAP_CLOUD, TREES_LIST, TREES_TARGET,
-    MISSION_STATE, MISSION_GUIDANCE, VEHICLE_STATE, COMMAND, COMMAND_NONCE, HEALTH, SIM_RGBD, SIM_CLOCK, SIM_TRUTH,
+    CAMERA_RGBD, CAMERA_COMPRESSED, SLAM_POSE, SLAM_KEYFRAME, SLAM_GRAPH, MAP_CLOUD, MAP_INDEX, MAP_GROUND, TREES_LIST, TREES_TARGET,
+    MISSION_STATE, MISSION_GUIDANCE, VEHICLE_STATE, COMMAND, COMMAND_NONCE, PREVIEW_IMAGE, HEALTH, SIM_RGBD, SIM_CLOCK, SIM_TRUTH,
 )  # fmt: skip
 
 LIVE = "live/*"

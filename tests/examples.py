@@ -8,8 +8,9 @@ from schemas.camera import Intrinsics, RgbdFrame
 from schemas.codec import Wire
 from schemas.command import Command, CommandReply, NonceReply, NonceRequest
 from schemas.health import Health
-from schemas.mapping import Submap
+from schemas.mapping import GroundCell, GroundPatch, MapIndex, Submap
 from schemas.navigation import Guidance, MissionState, Setpoint
+from schemas.preview import PreviewImage
 from schemas.simulation import SimClock, SimTruth, TrueTree
 from schemas.slam import Graph, GraphNode, Keyframe, Pose, Transform
 from schemas.trees import Target, Tree, TreeList
@@ -56,6 +57,10 @@ def all_messages() -> dict[str, Wire]:
     examples: list[Wire] = [
         frame(),
         submap(),
+        MapIndex(stamp_ns=66_000_000, map_id="map-1", epoch=1, graph_version=9, submap_ids=(5,), versions=(2,), placed_by=(9,),
+                 ground_sequence=4),
+        GroundPatch(stamp_ns=66_000_000, map_id="map-1", graph_version=9, sequence=4, cell_m=0.5, gone=((3, -2),), cells=(
+            GroundCell(column=-1, row=2, height_m=-1.5, slope_x=0.1, slope_y=-0.02, relief_m=0.015, points=212),)),
         Pose(stamp_ns=66_000_000, seq=1, map_id="map-1", status="tracking", T_map_camera=POSE, covariance=COVARIANCE,
              reset_counter=1, graph_version=4, keyframe_id=3, T_keyframe_camera=POSE, inliers=321, up_sigma_rad=0.004,
              processing_ms=18.5),
@@ -83,5 +88,6 @@ def all_messages() -> dict[str, Wire]:
         SimClock(stamp_ns=66_000_000, seq=1, phase="running", frames=2),
         SimTruth(stamp_ns=66_000_000, seq=1, scene="single-01", T_map_camera=POSE, trees=(true_tree,), touched=0,
                  clearance_m=1.2),
+        PreviewImage(b"\xff\xd8\xff\xe0 picture \xff\xd9"),
     ]  # fmt: skip
     return {example.SCHEMA: example for example in examples}  # type: ignore[attr-defined]
