@@ -1,0 +1,344 @@
+// The page: joins link, model, map, panels and orders. Redraws the map when something moved, the words four times a second.
+
+import { $, duration, el, keyed, set, text, words } from "./dom.js";
+import { onHold } from "./hold.js";
+import { Link } from "./link.js";
+import { MapView, palette } from "./map.js";
+import { Craft } from "./model.js";
+import { CHOOSE, OrderBar } from "./orders.js";
+import { drawLog, drawSystems, drawTrees, drawVitals } from "./panels.js";
+
+const WORDS_MS = 250;
+const TONES = { docked: "good", landed: "good", failed: "bad", released: "bad", hold: "warn", idle: "calm" };
+const TITLES = { idle: "Ready on the ground", preflight: "Checking before flight", take_off: "Taking off", scan: "Turning to scan", select: "Choosing a tree", face: "Turning to the tree", approach: "Approaching", dock: "Docking", docked: "Docked", undock: "Backing off", return: "Flying back", landing: "Landing", landed: "Landed", hold: "Holding", released: "Released to the pilot", failed: "Failed" };
+
+class Page {
+  constructor() {
+    this.crafts = new Map();
+    this.craft = null;
+    this.selected = null;
+    this.events = [];
+    this.me = null;
+    this.grid = false;
+    this.tiles = new Map();
+    this.map = new MapView($("map"), { onPick: (tree) => this.select(tree ? tree.id : null) });
+    this.map.onMoved = () => set($("follow"), "aria-pressed", this.map.follow);
+    this.orders = new OrderBar(this);
+    this.link = new Link({
+      state: (m) => this.onState(m),
+      trees: (m) => this.onTrees(m),
+      trail: (m) => this.craftOf(m.uav).takeTrail(m.map, m.points),
+      events: (m) => this.onEvents(m),
+      welcome: (m) => this.onWelcome(m),
+      binary: (data) => this.onBinary(data),
+    });
+    this.buttons();
+    this.theme(localStorage.getItem("treedock.theme") || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
+    setInterval(() => this.drawWords(), WORDS_MS);
+    let before = performance.now();
+    this.frames = 0;
+    const frame = (now) => {
+      this.drawMap(now, Math.min(0.1, (now - before) / 1000));
+      before = now;
+      this.frames++;
+      requestAnimationFrame(frame);
+    };
+    requestAnimationFrame(frame);
+  }
+
+  // -- what the station says
+
+  craftOf(uav) {
+    let craft = this.crafts.get(uav);
+    if (!craft) {
+      craft = new Craft(uav);
+      this.crafts.set(uav, craft);
+      if (!this.craft) this.choose(uav);
+    }
+    return craft;
+  }
+
+  onWelcome(message) {
+    this.me = message.you;
+    this.cloud = message.cloud;
+    text($("operator"), this.me.name);
+    this.events = [];
+    this.crafts.forEach((craft) => (craft.treesVersion = -1));
+  }
+
+  onState(message) {
+    const now = performance.now(), names = new Set(message.aircraft.map((view) => view.uav));
+    for (const view of message.aircraft) this.craftOf(view.uav).take(view, now);
+    for (const uav of this.crafts.keys()) if (!names.has(uav)) this.crafts.delete(uav);
+    if (this.craft && !this.crafts.has(this.craft.uav)) this.craft = null;
+    if (!this.craft && names.size) this.choose([...names][0]);
+    this.operators = message.operators;
+    this.map.dirty = true;
+  }
+
+  onTrees(message) {
+    this.craftOf(message.uav).takeTrees(message);
+    this.map.dirty = true;
+    this.view3d?.changed();
+  }
+
+  onEvents(message) {
+    if (message.all) this.events = [];
+    this.events.push(...message.items);
+    if (this.events.length > 600) this.events.splice(0, this.events.length - 400);
+  }
+
+  onBinary(data) {
+    const bytes = new Uint8Array(data), name = new TextDecoder().decode(bytes.subarray(2, 2 + bytes[1]));
+    if (bytes[0] !== 80) {
+      this.view3d?.take(name, data, 2 + bytes[1]);
+      return;
+    }
+    const craft = this.crafts.get(name);
+    if (!craft) return;
+    craft.previewAt = performance.now();
+    if (craft !== this.craft) return;
+    const image = $("preview-image"), url = URL.createObjectURL(new Blob([bytes.subarray(2 + bytes[1])], { type: "image/jpeg" }));
+    image.onload = image.onerror = () => URL.revokeObjectURL(url);
+    image.src = url;
+  }
+
+  // -- what the operator does
+
+  buttons() {
+    $("zoom-in").onclick = () => this.map.zoom(1.35);
+    $("zoom-out").onclick = () => this.map.zoom(1 / 1.35);
+    $("fit").onclick = () => (this.view3d?.on ? this.view3d.fit() : this.map.fit());
+    $("follow").onclick = () => {
+      this.map.follow = !this.map.follow;
+      this.map.fitted = false;
+      this.map.dirty = true;
+      set($("follow"), "aria-pressed", this.map.follow);
+    };
+    $("view-3d").onclick = () => this.toggle3d();
+    $("theme").onclick = () => this.theme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
+    $("operator").onclick = () => {
+      $("name-input").value = this.link.name;
+      $("name-dialog").showModal();
+    };
+    $("name-dialog").addEventListener("close", () => {
+      const name = $("name-input").value.trim();
+      if (name) this.link.name = name;
+      text($("operator"), this.link.name);
+    });
+    text($("operator"), this.link.name);
+    const tabs = ["trees", "log", "systems"];
+    for (const name of tabs) {
+      $(`tab-${name}`).onclick = () => this.tab(name);
+      $(`tab-${name}`).onkeydown = (e) => {
+        const step = { ArrowRight: 1, ArrowLeft: -1 }[e.key];
+        if (step) this.tab(tabs[(tabs.indexOf(name) + step + 3) % 3], true);
+      };
+    }
+    addEventListener("keydown", (e) => {
+      if (e.key.toLowerCase() === "h" && !e.repeat && !e.ctrlKey && !e.metaKey && !e.altKey && !(e.target instanceof HTMLInputElement)) this.orders.nodes.get("hold").dispatchEvent(new PointerEvent("pointerdown", { button: 0, pointerId: 0 }));
+    });
+  }
+
+  tab(name, focus = false) {
+    for (const other of ["trees", "log", "systems"]) {
+      set($(`tab-${other}`), "aria-selected", other === name);
+      set($(`tab-${other}`), "tabindex", other === name ? 0 : -1);
+      $(`panel-${other}`).hidden = other !== name;
+    }
+    if (focus) $(`tab-${name}`).focus();
+    this.drawWords();
+  }
+
+  theme(name) {
+    document.documentElement.dataset.theme = name;
+    localStorage.setItem("treedock.theme", name);
+    const colours = palette();
+    for (const map of [this.map, ...[...this.tiles.values()].map((t) => t.map)]) {
+      map.colours = colours;
+      map.dirty = true;
+    }
+    this.view3d?.theme(colours);
+  }
+
+  choose(uav) {
+    this.grid = uav === null;
+    if (uav !== null && this.craft?.uav !== uav) {
+      this.craft = this.crafts.get(uav);
+      this.selected = this.map.selected = null;
+      this.map.show(this.craft);
+      this.view3d?.show(this.craft);
+      $("preview-image").removeAttribute("src");
+    }
+    $("grid").hidden = !this.grid;
+    this.drawWords();
+  }
+
+  select(id) {
+    this.selected = this.map.selected = id;
+    this.map.dirty = true;
+    this.view3d?.changed();
+    if (id !== null) this.tab("trees");
+    this.drawWords();
+    if (id !== null) $("panel-trees").querySelector('[aria-expanded="true"]')?.scrollIntoView({ block: "nearest" });
+  }
+
+  treeActions(tree) {
+    const about = el("p"), node = el("button", { class: "mini", id: "choose" }, el("span", {}, "Fly to this tree"));
+    const more = el("div", { class: "tree-more" }, about, node);
+    onHold(node, () => this.orders.press(CHOOSE, more.tree.id), () => this.toast("info", "Keep it pressed for one second."));
+    more.refresh = (t, kind) => {
+      more.tree = t;
+      text(about, `⌀ ${(t.radius * 200).toFixed(1)} ± ${(t.sigmaRadius * 200).toFixed(1)} cm, seen ${t.observations} times, ${Math.round((t.arc * 180) / Math.PI)}° of its bark. At x ${t.x.toFixed(2)}, y ${t.y.toFixed(2)} m.`);
+      const why = t.suitable ? this.orders.why(CHOOSE) : "Not suitable: too thin, too thick, forked or leaning.";
+      text(node.firstChild, kind === "target" ? "This is the target" : why && !t.suitable ? why : "Fly to this tree (hold)");
+      set(node, "aria-disabled", why || kind === "target" ? "true" : null);
+    };
+    more.refresh(tree, this.craft.kind(tree));
+    return more;
+  }
+
+  toast(level, words) {
+    const node = el("div", { class: "toast", "data-level": level }, words);
+    $("toasts").append(node);
+    while ($("toasts").children.length > 3) $("toasts").firstChild.remove();
+    setTimeout(() => node.remove(), level === "bad" ? 7000 : 4000);
+  }
+
+  async toggle3d() {
+    if (!this.view3d) {
+      const { View3d } = await import("./view3d.js");
+      this.view3d = new View3d($("three"), this);
+    }
+    const on = !this.view3d.on;
+    this.view3d.set(on);
+    $("three").hidden = !on;
+    $("map").hidden = on;
+    set($("view-3d"), "aria-pressed", on);
+  }
+
+  // -- drawing
+
+  drawMap(now, dt) {
+    let moving = false;
+    for (const craft of this.crafts.values()) moving = craft.glide(dt) || moving;
+    if (this.view3d?.on && !this.grid) {
+      this.view3d.draw(now, moving);
+      return;
+    }
+    if (this.grid) {
+      for (const [uav, tile] of this.tiles) if (moving || tile.map.dirty || this.map.dirty) {
+        tile.map.craft = this.crafts.get(uav);
+        tile.map.draw(now);
+        tile.map.dirty = false;
+      }
+      this.map.dirty = false;
+    } else if (moving || this.map.dirty) {
+      this.map.draw(now);
+      this.map.dirty = false;
+    }
+  }
+
+  drawWords() {
+    const now = performance.now(), craft = this.craft;
+    this.drawFleet(now);
+    if (this.grid) this.drawTiles(now);
+    this.drawMission(craft, now);
+    this.drawAlarm(craft, now);
+    drawVitals(craft, now);
+    if (!$("panel-trees").hidden) drawTrees(craft, this);
+    if (!$("panel-log").hidden) drawLog(this.events, this.grid ? null : craft?.uav, this.crafts.size > 1);
+    drawSystems(craft, now);
+    this.drawPreview(craft, now);
+    this.orders.draw();
+    this.map.dirty ||= craft ? craft.link(now) !== this.linkWas : false;
+    this.linkWas = craft?.link(now);
+  }
+
+  drawFleet(now) {
+    const items = [...this.crafts.values()].map((craft) => ({ key: craft.uav, craft }));
+    if (items.length > 1) items.unshift({ key: "*", craft: null });
+    keyed($("fleet"), items, (i) => i.key, (i) => {
+      const node = el("button", { class: "chip" }, el("i", { class: "dot" }), el("div", {}, el("b"), el("small")));
+      node.onclick = () => this.choose(i.craft ? i.craft.uav : null);
+      return node;
+    }, (node, { craft }) => {
+      const [dot, box] = node.children, link = craft?.link(now) ?? "none";
+      set(dot, "data-level", link);
+      set(dot, "hidden", craft ? null : "");
+      text(box.firstChild, craft ? craft.uav : "All");
+      text(box.lastChild, craft ? (link === "lost" ? "link lost" : words(craft.view?.mission?.state ?? "no mission")) : `${this.crafts.size} aircraft`);
+      set(node, "aria-pressed", craft ? !this.grid && craft === this.craft : this.grid);
+    });
+    const up = this.link.up;
+    text($("station-link"), up ? "station" : "station lost");
+    set($("station-link"), "data-level", up ? "good" : "lost");
+  }
+
+  drawTiles(now) {
+    keyed($("grid"), [...this.crafts.values()], (c) => c.uav, (c) => {
+      const canvas = el("canvas"), node = el("button", { class: "tile" }, el("header", {}, el("i", { class: "dot" }), el("b"), el("span"), el("small")), canvas);
+      const map = new MapView(canvas, { bare: true });
+      map.show(c);
+      this.tiles.set(c.uav, { node, map });
+      node.onclick = () => this.choose(c.uav);
+      return node;
+    }, (node, c) => {
+      const [dot, name, right, reason] = node.firstChild.children, link = c.link(now), v = c.view;
+      set(dot, "data-level", link);
+      set(node, "data-level", link);
+      text(name, c.uav);
+      text(right, v?.vehicle?.battery == null ? "" : `${Math.round(v.vehicle.battery * 100)} %`);
+      text(reason, link === "lost" ? `link lost, ${duration(c.linkAge(now))}` : v?.mission ? `${TITLES[v.mission.state] ?? words(v.mission.state)}: ${v.mission.reason}` : "no mission is heard");
+      this.tiles.get(c.uav).map.dirty = true;
+    });
+    for (const uav of this.tiles.keys()) if (!this.crafts.has(uav)) this.tiles.delete(uav);
+  }
+
+  drawMission(craft, now) {
+    const mission = craft?.view?.mission;
+    $("mission").hidden = this.grid;
+    if (!mission) {
+      text($("mission-state"), craft ? "No mission is heard" : "No aircraft yet");
+      text($("mission-for"), "");
+      text($("mission-reason"), craft ? "Is the navigator running?" : "Waiting for an aircraft to be heard.");
+      $("mission-target").hidden = true;
+      set($("mission"), "data-tone", "calm");
+      return;
+    }
+    const age = craft.age(mission.age, now), late = age > 1.25;
+    text($("mission-state"), TITLES[mission.state] ?? words(mission.state));
+    text($("mission-for"), late ? `told ${duration(age)} ago` : duration(mission.for + age));
+    set($("mission-for"), "class", late ? "mission-for late" : "mission-for");
+    const same = mission.reason.toLowerCase() === mission.state;
+    text($("mission-reason"), (mission.failsafe ? `Failsafe ${words(mission.failsafe)}: ` : "") + (same ? "" : mission.reason));
+    const tree = mission.target;
+    $("mission-target").hidden = tree === null;
+    if (tree !== null) text($("mission-target"), `Tree ${tree}${mission.distance === null ? "" : ` · ${mission.distance.toFixed(2)} m`}${mission.heading_error === null ? "" : ` · ${Math.abs((mission.heading_error * 180) / Math.PI).toFixed(0)}° ${mission.heading_error >= 0 ? "left" : "right"}`}`);
+    set($("mission"), "data-tone", late ? "warn" : mission.failsafe ? "warn" : TONES[mission.state] ?? "fly");
+  }
+
+  drawAlarm(craft, now) {
+    const alarm = $("alarm"), others = [...this.crafts.values()].filter((c) => c !== craft && c.link(now) === "lost");
+    let said = "";
+    if (!this.link.up) said = "STATION OUT OF REACH: what you see is old, no order will arrive";
+    else if (craft?.link(now) === "lost") said = `LINK TO ${craft.uav} LOST for ${duration(craft.linkAge(now))}: what you see is old`;
+    else if (craft?.view?.vehicle?.override) said = "THE PILOT HAS THE AIRCRAFT: the mission is silent";
+    else if (others.length) said = `LINK LOST to ${others.map((c) => c.uav).join(", ")}`;
+    text(alarm, said);
+    alarm.hidden = !said;
+    set(document.body, "data-old", said && (!this.link.up || craft?.link(now) === "lost") ? "true" : null);
+    set(document.body, "data-link", craft ? craft.link(now) : "none");
+  }
+
+  drawPreview(craft, now) {
+    const age = craft ? (now - craft.previewAt) / 1000 : Infinity, none = !Number.isFinite(age) || age > 60;
+    $("preview").hidden = this.grid;
+    set($("preview"), "data-empty", none ? "true" : null);
+    $("preview-image").hidden = none || !$("preview-image").src;
+    text($("preview-word"), none ? "no preview" : age > 1.5 ? `${duration(age)} old` : "live");
+    set($("preview-word"), "class", age > 1.5 && !none ? "late" : null);
+  }
+}
+
+window.treedock = new Page();

@@ -1,0 +1,373 @@
+// The map from above: x up the screen (the first camera heading), y to the left, metres.
+
+import { CONE_M, CONE_RAD } from "./model.js";
+
+const MIN_SCALE = 6, MAX_SCALE = 400; // pixels per metre
+
+/** The colours of the present theme. */
+export function palette() {
+  const style = getComputedStyle(document.documentElement);
+  const of = (name) => style.getPropertyValue(`--${name}`).trim();
+  return {
+    map: of("map"), grid: of("map-grid"), grid5: of("map-grid-5"), ink: of("map-ink"), seen: of("seen"), cone: of("cone"), coneLine: of("cone-line"), craft: of("craft"),
+    trail: of("trail"), tree: of("tree"), treeInk: of("tree-ink"), un: of("tree-un"), visited: of("tree-visited"), target: of("tree-target"), soft: of("soft"), surface: of("surface"),
+  };
+}
+
+export class MapView {
+  constructor(canvas, { onPick = null, bare = false } = {}) {
+    this.canvas = canvas;
+    this.bare = bare;
+    this.onPick = onPick;
+    this.centre = { x: 0, y: 0 };
+    this.scale = 40;
+    this.follow = false;
+    this.fitted = true; // as long as nobody moved it, it keeps everything in view
+    this.craft = null;
+    this.selected = null;
+    this.colours = palette();
+    this.dirty = true;
+    if (!bare) this.listen();
+    new ResizeObserver(() => this.resize()).observe(canvas);
+  }
+
+  resize() {
+    const ratio = Math.min(devicePixelRatio || 1, 2), box = this.canvas.getBoundingClientRect();
+    this.width = box.width;
+    this.height = box.height;
+    this.canvas.width = Math.max(1, Math.round(box.width * ratio));
+    this.canvas.height = Math.max(1, Math.round(box.height * ratio));
+    this.ratio = ratio;
+    this.dirty = true;
+  }
+
+  show(craft) {
+    if (this.craft !== craft) this.fitted = true;
+    this.craft = craft;
+    this.dirty = true;
+  }
+
+  /** Map to pixels: map x is up, map y is left. */
+  px(x, y) {
+    return [this.width / 2 - (y - this.centre.y) * this.scale, this.height / 2 - (x - this.centre.x) * this.scale];
+  }
+
+  at(u, v) {
+    return { x: this.centre.x - (v - this.height / 2) / this.scale, y: this.centre.y - (u - this.width / 2) / this.scale };
+  }
+
+  // -- hands and keys
+
+  listen() {
+    const pointers = new Map();
+    let moved = 0, spread = 0;
+    const c = this.canvas;
+    const local = (e) => ({ u: e.clientX - c.getBoundingClientRect().left, v: e.clientY - c.getBoundingClientRect().top });
+    c.addEventListener("pointerdown", (e) => {
+      c.setPointerCapture(e.pointerId);
+      pointers.set(e.pointerId, local(e));
+      moved = pointers.size > 1 ? 99 : 0;
+      spread = 0;
+    });
+    c.addEventListener("pointermove", (e) => {
+      const from = pointers.get(e.pointerId);
+      if (!from) return;
+      const to = local(e);
+      pointers.set(e.pointerId, to);
+      moved += Math.abs(to.u - from.u) + Math.abs(to.v - from.v);
+      if (moved < 6) return;
+      const share = 1 / pointers.size;
+      this.move((to.u - from.u) * share, (to.v - from.v) * share);
+      if (pointers.size === 2) {
+        const [a, b] = [...pointers.values()], now = Math.hypot(a.u - b.u, a.v - b.v);
+        if (spread) this.zoom(now / spread, (a.u + b.u) / 2, (a.v + b.v) / 2);
+        spread = now;
+      }
+    });
+    const up = (e) => {
+      if (!pointers.delete(e.pointerId)) return;
+      spread = 0;
+      if (e.type === "pointerup" && moved < 6) this.pick(local(e));
+    };
+    c.addEventListener("pointerup", up);
+    c.addEventListener("pointercancel", up);
+    c.addEventListener("wheel", (e) => {
+      e.preventDefault();
+      const { u, v } = local(e);
+      this.zoom(Math.exp(-e.deltaY * 0.0015), u, v);
+    }, { passive: false });
+    c.addEventListener("keydown", (e) => {
+      const step = { ArrowUp: [0, 60], ArrowDown: [0, -60], ArrowLeft: [60, 0], ArrowRight: [-60, 0] }[e.key];
+      if (step) this.move(...step);
+      else if (e.key === "+" || e.key === "=") this.zoom(1.3);
+      else if (e.key === "-") this.zoom(1 / 1.3);
+      else if (e.key === "f" || e.key === "F") this.fit();
+      else return;
+      e.preventDefault();
+    });
+  }
+
+  move(du, dv) {
+    this.centre.x += dv / this.scale;
+    this.centre.y += du / this.scale;
+    this.follow = this.fitted = false;
+    this.dirty = true;
+    this.onMoved?.();
+  }
+
+  zoom(by, u = this.width / 2, v = this.height / 2) {
+    const before = this.at(u, v);
+    this.scale = Math.min(MAX_SCALE, Math.max(MIN_SCALE, this.scale * by));
+    const after = this.at(u, v);
+    this.centre.x += before.x - after.x;
+    this.centre.y += before.y - after.y;
+    this.fitted = false;
+    this.dirty = true;
+  }
+
+  pick({ u, v }) {
+    const p = this.at(u, v);
+    let best = null, near = 26 / this.scale;
+    for (const tree of this.craft?.trees ?? []) {
+      const far = Math.max(0, Math.hypot(tree.x - p.x, tree.y - p.y) - tree.radius);
+      if (far < near) [best, near] = [tree, far];
+    }
+    this.onPick?.(best);
+  }
+
+  /** Show trees and aircraft whole, at least 8 m across. */
+  fit() {
+    this.fitted = true;
+    this.follow = false;
+    this.dirty = true;
+    this.onMoved?.();
+  }
+
+  applyFit() {
+    const craft = this.craft;
+    if (!craft || !this.width) return;
+    const points = craft.trees.filter((t) => Math.hypot(t.x, t.y) < 60).map((t) => [t.x, t.y]);
+    const at = craft.shown;
+    points.push([0, 0]);
+    if (at) points.push([at.x, at.y]);
+    const xs = points.map((p) => p[0]), ys = points.map((p) => p[1]);
+    const box = { x0: Math.min(...xs), x1: Math.max(...xs), y0: Math.min(...ys), y1: Math.max(...ys) };
+    const margin = this.bare ? 12 : 46;
+    const top = this.bare ? 0 : Math.min(110, this.height * 0.2); // the mission's card
+    const scale = Math.min((this.width - 2 * margin) / Math.max(8, box.y1 - box.y0), (this.height - 2 * margin - top) / Math.max(8, box.x1 - box.x0));
+    this.scale = Math.min(MAX_SCALE, Math.max(MIN_SCALE * 0.5, scale));
+    this.centre = { x: (box.x0 + box.x1) / 2 + top / 2 / this.scale, y: (box.y0 + box.y1) / 2 };
+  }
+
+  // -- drawing
+
+  draw(now) {
+    if (!this.width) return;
+    if (this.fitted) this.applyFit();
+    else if (this.follow && this.craft?.shown) this.centre = { x: this.craft.shown.x, y: this.craft.shown.y };
+    const c = this.canvas.getContext("2d");
+    c.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
+    c.fillStyle = this.colours.map;
+    c.fillRect(0, 0, this.width, this.height);
+    const craft = this.craft;
+    if (craft) this.drawSeen(c, craft);
+    this.drawGrid(c);
+    if (!craft) return;
+    this.drawTrail(c, craft);
+    this.drawCone(c, craft);
+    this.drawWay(c, craft);
+    for (const tree of craft.trees) this.drawTree(c, craft, tree);
+    this.drawMeasured(c, craft, now);
+    this.drawCraft(c, craft, now);
+    if (!this.bare) this.drawScale(c);
+  }
+
+  drawSeen(c, craft) {
+    const { seen } = craft, side = seen.size * seen.cell * this.scale, [u, v] = this.px(0, 0);
+    c.save();
+    c.translate(u, v);
+    c.rotate(-Math.PI / 2); // the image has x to the right
+    c.imageSmoothingEnabled = true;
+    c.drawImage(seen.image(this.colours.seen), -side / 2, -side / 2, side, side);
+    c.restore();
+  }
+
+  drawGrid(c) {
+    const a = this.at(0, this.height), b = this.at(this.width, 0);
+    const step = this.scale < 12 ? 5 : 1;
+    c.lineWidth = 1;
+    for (let x = Math.ceil(a.x / step) * step; x <= b.x; x += step) this.gridLine(c, this.px(x, a.y), this.px(x, b.y), x % 5 === 0);
+    for (let y = Math.ceil(b.y / step) * step; y <= a.y; y += step) this.gridLine(c, this.px(a.x, y), this.px(b.x, y), y % 5 === 0);
+    const [u, v] = this.px(0, 0);
+    c.strokeStyle = this.colours.soft;
+    c.lineWidth = 2;
+    c.beginPath();
+    c.moveTo(u - 9, v); c.lineTo(u + 9, v); c.moveTo(u, v - 9); c.lineTo(u, v + 9);
+    c.stroke();
+    if (!this.bare) this.label(c, "start", u + 8, v + 16, this.colours.soft, 13);
+  }
+
+  gridLine(c, [u0, v0], [u1, v1], bold) {
+    c.strokeStyle = bold ? this.colours.grid5 : this.colours.grid;
+    c.beginPath();
+    c.moveTo(Math.round(u0) + 0.5, Math.round(v0) + 0.5);
+    c.lineTo(Math.round(u1) + 0.5, Math.round(v1) + 0.5);
+    c.stroke();
+  }
+
+  drawTrail(c, craft) {
+    if (craft.trail.length < 2) return;
+    c.strokeStyle = this.colours.trail;
+    c.lineWidth = 3;
+    c.lineJoin = "round";
+    c.beginPath();
+    for (const [x, y] of craft.trail) c.lineTo(...this.px(x, y));
+    c.stroke();
+  }
+
+  drawCone(c, craft) {
+    const at = craft.shown;
+    if (!at) return;
+    const [u, v] = this.px(at.x, at.y), middle = -Math.PI / 2 - at.yaw, r = CONE_M * this.scale;
+    c.beginPath();
+    c.moveTo(u, v);
+    c.arc(u, v, r, middle - CONE_RAD / 2, middle + CONE_RAD / 2);
+    c.closePath();
+    c.fillStyle = this.colours.cone;
+    c.fill();
+    c.strokeStyle = this.colours.coneLine;
+    c.lineWidth = 1.2;
+    c.stroke();
+  }
+
+  drawWay(c, craft) {
+    const mission = craft.view?.mission, tree = craft.trees.find((t) => t.id === mission?.target), at = craft.shown;
+    if (!tree || !at || mission.map !== craft.treesMap) return;
+    c.setLineDash([7, 6]);
+    c.strokeStyle = this.colours.target;
+    c.lineWidth = 2;
+    c.beginPath();
+    c.moveTo(...this.px(at.x, at.y));
+    c.lineTo(...this.px(tree.x, tree.y));
+    c.stroke();
+    c.setLineDash([]);
+  }
+
+  drawTree(c, craft, tree) {
+    const [u, v] = this.px(tree.x, tree.y);
+    if (u < -60 || v < -60 || u > this.width + 60 || v > this.height + 60) return;
+    const kind = craft.kind(tree), k = this.colours;
+    const least = this.bare ? 2.5 : 5, r = Math.max(tree.radius * this.scale, least);
+    const doubt = (tree.radius + 2 * tree.sigma) * this.scale;
+    const colour = { suitable: k.tree, unsuitable: k.un, visited: k.visited, target: k.target }[kind];
+    if (doubt > r + 1.5) {
+      c.strokeStyle = colour;
+      c.globalAlpha = 0.55;
+      c.lineWidth = 1.5;
+      circle(c, u, v, doubt);
+      c.stroke();
+      c.globalAlpha = 1;
+    }
+    circle(c, u, v, r);
+    if (kind === "unsuitable") {
+      c.setLineDash([3, 2.5]);
+      c.strokeStyle = colour;
+      c.lineWidth = 2;
+      c.fillStyle = k.map;
+      c.fill();
+      c.stroke();
+      c.setLineDash([]);
+    } else {
+      c.fillStyle = kind === "target" && !tree.suitable ? k.un : colour;
+      c.fill();
+    }
+    if (kind === "target") {
+      c.strokeStyle = colour;
+      c.lineWidth = this.bare ? 2 : 3.5;
+      circle(c, u, v, Math.max(r, doubt) + 7);
+      c.stroke();
+    }
+    if (kind === "visited" && !this.bare) {
+      c.strokeStyle = colour;
+      c.lineWidth = 3;
+      c.beginPath();
+      c.moveTo(u + r + 5, v - r - 4); c.lineTo(u + r + 9, v - r); c.lineTo(u + r + 17, v - r - 11);
+      c.stroke();
+    }
+    if (tree.id === this.selected) {
+      c.strokeStyle = k.ink;
+      c.lineWidth = 2.5;
+      circle(c, u, v, Math.max(r, doubt) + 13);
+      c.stroke();
+    }
+    if (!this.bare && (this.scale > 14 || kind !== "unsuitable")) {
+      this.label(c, String(tree.id), u + r + 5, v + r + 14, kind === "unsuitable" ? k.soft : k.ink, 15);
+    }
+  }
+
+  drawMeasured(c, craft) {
+    const t = craft.view?.target;
+    if (!t?.at || t.status !== "tracking") return;
+    const [u, v] = this.px(t.at[0], t.at[1]);
+    c.strokeStyle = this.colours.target;
+    c.lineWidth = 2;
+    c.beginPath();
+    c.moveTo(u - 7, v - 7); c.lineTo(u + 7, v + 7); c.moveTo(u + 7, v - 7); c.lineTo(u - 7, v + 7);
+    c.stroke();
+  }
+
+  drawCraft(c, craft, now) {
+    const at = craft.shown;
+    if (!at) return;
+    const [u, v] = this.px(at.x, at.y), r = Math.max(0.32 * this.scale, this.bare ? 9 : 14);
+    const fresh = craft.link(now) === "good" && craft.view.pose.status === "tracking";
+    const sigma = craft.view.pose.sigma;
+    if (sigma && 2 * sigma * this.scale > r) {
+      circle(c, u, v, 2 * sigma * this.scale);
+      c.strokeStyle = this.colours.coneLine;
+      c.lineWidth = 1.5;
+      c.stroke();
+    }
+    c.save();
+    c.translate(u, v);
+    c.rotate(-at.yaw);
+    c.beginPath();
+    c.moveTo(0, -r * 1.25); c.lineTo(r * 0.85, r * 0.95); c.lineTo(0, r * 0.5); c.lineTo(-r * 0.85, r * 0.95);
+    c.closePath();
+    c.fillStyle = fresh ? this.colours.craft : this.colours.map;
+    c.strokeStyle = fresh ? this.colours.surface : this.colours.craft;
+    c.lineWidth = fresh ? 2 : 3;
+    if (!fresh) c.setLineDash([4, 3]);
+    c.fill();
+    c.stroke();
+    c.restore();
+    c.setLineDash([]);
+    if (!this.bare) this.label(c, craft.uav, u + r + 4, v - r, this.colours.craft, 15);
+  }
+
+  drawScale(c) {
+    const metres = [0.5, 1, 2, 5, 10, 20, 50].find((m) => m * this.scale > 70) ?? 50, w = metres * this.scale;
+    const u = this.width - w - 18, v = this.height - 62;
+    c.strokeStyle = c.fillStyle = this.colours.ink;
+    c.lineWidth = 3;
+    c.beginPath();
+    c.moveTo(u, v - 6); c.lineTo(u, v); c.lineTo(u + w, v); c.lineTo(u + w, v - 6);
+    c.stroke();
+    this.label(c, `${metres} m`, u + w / 2 - 14, v - 8, this.colours.ink, 14);
+  }
+
+  label(c, words, u, v, colour, size) {
+    c.font = `650 ${size}px system-ui, "DejaVu Sans", sans-serif`;
+    c.lineWidth = 4;
+    c.lineJoin = "round";
+    c.strokeStyle = this.colours.map;
+    c.strokeText(words, u, v);
+    c.fillStyle = colour;
+    c.fillText(words, u, v);
+  }
+}
+
+function circle(c, u, v, r) {
+  c.beginPath();
+  c.arc(u, v, r, 0, 2 * Math.PI);
+}

@@ -1,0 +1,156 @@
+"""An aircraft without a camera: the real mission over a small world, on the real bus.
+
+As a process: ``python -m tests.station.stub_aircraft PORT UAV [SPEED] [SEED]``.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from typing import get_args
+
+import numpy as np
+
+from schemas.command import Command, CommandName, CommandReply, NonceReply, NonceRequest
+from schemas.health import Health
+from schemas.topics import (
+    COMMAND,
+    COMMAND_NONCE,
+    HEALTH,
+    MISSION_STATE,
+    SLAM_POSE,
+    TREES_LIST,
+    TREES_TARGET,
+    VEHICLE_STATE,
+)
+from schemas.trees import Tree, TreeList
+from services.common.config import TreedockConfig
+from services.common.geometry import wrap_angle
+from services.common.health import HealthReporter
+from services.common.runtime import LiveContext, run_service
+from services.common.stop import end_process
+from services.navigator.commands import CommandDesk
+from services.router.config import RouterConfig
+from tests.unit.navigator_world import SERVICES, STEP_S, World, tree
+
+_COVARIANCE = tuple(
+    {0: 4e-4, 6: 4e-4, 11: 4e-4, 15: 1e-5, 18: 1e-5, 20: 1e-5}.get(i, 0.0) for i in range(21)
+)  # fmt: skip
+_TICK_S = 0.1
+_VIEW_RAD = math.radians(59.0) / 2.0
+
+
+def forest(seed: int) -> list[Tree]:
+    """Trees around the start, some too thick or too thin, none where the aircraft stands."""
+    rng = np.random.default_rng(seed)
+    found: list[Tree] = []
+    while len(found) < 14:
+        x, y = rng.uniform(-7.0, 8.0), rng.uniform(-6.5, 6.5)
+        clear = all(math.hypot(t.x_m - x, t.y_m - y) > 1.6 for t in found)
+        if math.hypot(x, y) > 2.4 and clear:
+            thick = rng.random() < 0.2
+            radius = float(rng.uniform(0.21, 0.30) if thick else rng.uniform(0.05, 0.17))
+            found.append(tree(len(found) + 1, float(x), float(y), radius, suitable=not thick))
+    return found
+
+
+class StubAircraft:
+    """Steps the world, publishes what the aircraft's services would, answers commands."""
+
+    def __init__(self, context: LiveContext, speed: int, seed: int) -> None:
+        self.context = context
+        self.world = World(trees=forest(seed), station=False)
+        self.speed = speed
+        self.known: dict[int, Tree] = {}
+        self.version = 0
+        self.desk = CommandDesk(10.0, lambda: os.urandom(16))
+        self._rng = np.random.default_rng(seed)
+        self._reporters = {name: HealthReporter(name, context.health) for name in (*SERVICES, "navigator", "autopilot")}
+        self._heard_station_s = -1.0
+        self._ticks = 0
+
+    def register(self) -> None:
+        c = self.context
+        for name in self._reporters:
+            if name != c.service:
+                c.bus.declare_live(name)
+        c.on(HEALTH, self._on_station, leaf="station")
+        c.answer(COMMAND_NONCE, NonceRequest, self._on_nonce)
+        for name in get_args(CommandName):
+            c.answer(COMMAND, Command, self._on_command, leaf=name)
+        c.every_wall(_TICK_S, self.tick)
+        c.every_wall(1.0, self._tell_health)
+
+    def tick(self) -> None:
+        world, c = self.world, self.context
+        for _ in range(max(1, round(self.speed * _TICK_S / STEP_S))):
+            world.battery = max(0.0, (world.battery or 0.0) - (2e-5 if world.armed else 0.0))
+            world.step()
+        self._ticks += 1
+        world.revision += self._ticks % 50 == 0  # the mission's own list stays young
+        assert world.outputs is not None
+        assert world._pose is not None
+        pose = world._pose.message.model_copy(update={"covariance": _COVARIANCE, "seq": self._ticks})
+        c.publish(SLAM_POSE, pose)
+        if world._vehicle is not None:
+            c.publish(VEHICLE_STATE, world._vehicle.message.model_copy(update={"seq": self._ticks}))
+        if world._target is not None:
+            c.publish(TREES_TARGET, world._target.message.model_copy(update={"seq": self._ticks}))
+        c.publish(MISSION_STATE, world.outputs.state.model_copy(update={"seq": self._ticks}))
+        if self._look():
+            self.version += 1
+            trees = tuple(self.known[k] for k in sorted(self.known))
+            c.publish(TREES_LIST, TreeList(stamp_ns=world.now_ns, map_id=world.map_id, version=self.version, graph_version=0, trees=trees))  # fmt: skip
+
+    def _look(self) -> bool:
+        """Take in the trees that the camera sees: each look makes the belief better."""
+        world = self.world
+        if world.position_m[2] < 1.0 or self._ticks % 5:
+            return False
+        changed = False
+        for t in world.trees:
+            dx, dy = t.x_m - world.position_m[0], t.y_m - world.position_m[1]
+            far = math.hypot(dx, dy)
+            if far > 7.5 or abs(wrap_angle(math.atan2(dy, dx) - world.yaw_rad)) > _VIEW_RAD:
+                continue
+            looks = self.known[t.id].observations + 1 if t.id in self.known else 1
+            sigma = 0.12 / math.sqrt(looks)
+            noise = self._rng.normal(0.0, sigma / 3.0, 3)
+            self.known[t.id] = t.model_copy(update={
+                "x_m": t.x_m + float(noise[0]), "y_m": t.y_m + float(noise[1]), "radius_m": max(0.02, t.radius_m + float(noise[2]) / 10),
+                "sigma_xy_m": sigma, "sigma_radius_m": sigma / 10, "observations": looks, "confidence": 1.0 - 0.6 / looks,
+            })  # fmt: skip
+            changed = True
+        return changed
+
+    def _tell_health(self) -> None:
+        self.world.station = self.context.wall.now_ns() * 1e-9 - self._heard_station_s < 2.5
+        for name, reporter in self._reporters.items():
+            if name not in self.world.dead:
+                health = reporter.report(self.context.wall.now_ns(), self.context.bus.passed)
+                if name != self.context.service:
+                    self.context.publish(HEALTH, health, leaf=name)
+
+    def _on_station(self, _: Health) -> None:
+        self._heard_station_s = self.context.wall.now_ns() * 1e-9
+
+    def _on_nonce(self, request: NonceRequest) -> NonceReply:
+        return self.desk.issue(request.sender, self.context.wall.now_ns())
+
+    def _on_command(self, command: Command) -> CommandReply:
+        reason = self.desk.refusal(command, self.context.wall.now_ns())
+        if reason:
+            return CommandReply(accepted=False, reason=reason, state=self.world.state)
+        verdict = self.world.mission.order(command.name, command.tree_id, self.world.now_ns)
+        return CommandReply(accepted=verdict.accepted, reason=verdict.reason, state=self.world.state)
+
+
+def main(port: int, uav: str, speed: int, seed: int) -> int:
+    config = TreedockConfig(router=RouterConfig(port=port), uav=uav)
+    return run_service("navigator", lambda c: StubAircraft(c, speed, seed).register(), config)
+
+
+if __name__ == "__main__":
+    arguments = sys.argv[1:] + ["1", "0"][len(sys.argv) - 3 :]
+    end_process(main(int(arguments[0]), arguments[1], int(arguments[2]), int(arguments[3])))
