@@ -18,6 +18,7 @@ BENCHES: dict[str, str] = {
     "detection": "services.evaluate.bench_detection",
     "slam": "services.evaluate.bench_slam",
     "refine": "services.evaluate.bench_refine",
+    "latency": "services.evaluate.bench_latency",
     "depth": "services.evaluate.bench_depth",
     "missions": "services.evaluate.bench_missions",
     "system": "services.evaluate.bench_system",

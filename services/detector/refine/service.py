@@ -94,8 +94,9 @@ class RefinerService:
             self._answer_oldest()
 
     def _answer_oldest(self) -> None:
-        stamp_ns, (_, frame) = self._waiting.popitem(last=False)
+        stamp_ns, (received_ns, frame) = self._waiting.popitem(last=False)
         self._last_ns = stamp_ns
+        self._health.stage_ms["wait_for_pose"].append((self._context.clock.now_ns() - received_ns) * 1e-6)
         with self._health.timed("refine"):
             state = self._state(frame, self._poses.get(stamp_ns))
         self._health.count("measured", int(state.measured))
