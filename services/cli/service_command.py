@@ -21,6 +21,7 @@ SERVICES = {
     "refiner": "The target tree in the depth image, at frame rate.",
     "navigator": "The mission: scan, choose, approach, dock.",
     "autopilot": "The bridge to PX4.",
+    "preview": "A small picture with the overlay, for the ground.",
     "recorder": "Everything worth keeping, into MCAP files.",
     "simulator": "A forest, a camera that sees it, and simulated time.",
 }

@@ -14,6 +14,7 @@ from services.detector.refine.config import RefinerConfig
 from services.mapper.config import MapperConfig
 from services.navigator.autopilot.config import AutopilotConfig
 from services.navigator.config import NavigatorConfig
+from services.preview.config import PreviewConfig
 from services.recorder.config import RecorderConfig
 from services.router.config import RouterConfig
 from services.security.config import SecurityConfig
@@ -42,6 +43,7 @@ class TreedockConfig(BaseModel):
     refiner: RefinerConfig = RefinerConfig()
     simulator: SimulatorConfig = SimulatorConfig()
     recorder: RecorderConfig = RecorderConfig()
+    preview: PreviewConfig = PreviewConfig()
     navigator: NavigatorConfig = Field(default_factory=NavigatorConfig)
     autopilot: AutopilotConfig = Field(default_factory=AutopilotConfig)
     station: StationConfig = StationConfig()

@@ -1,0 +1,172 @@
+"""What the operator is shown: shapes in pixels, worked out from the messages. Pure; drawing is in ``draw``.
+
+The reference's colours: a red arrow for the command, a blue outline where the map expects the tree, a green one where
+the depth image shows it, a green frame when docked.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from schemas.camera import Intrinsics
+from schemas.navigation import Guidance, MissionState
+from schemas.slam import Pose
+from schemas.trees import Target, Tree
+from services.common.geometry import apply, from_transform, inverse
+
+Pixel = tuple[float, float]
+Quad = tuple[Pixel, Pixel, Pixel, Pixel]
+
+_NEAR_M = 0.2
+_TRUNK_LOW_M, _TRUNK_HIGH_M = 0.0, 2.5
+"""Part of a trunk that is outlined, above its ground."""
+_OTHER_WITHIN_M = 8.0
+_WORDS = {
+    "take_off": "take off", "landing": "land", "turn_left": "turn left", "turn_right": "turn right", "toward": "forward",
+    "backward": "back", "stop": "stop", "docked": "docked",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Outline:
+    """A trunk's outline in the picture."""
+
+    quad: Quad
+    """Corners at low left, low right, high right, high left."""
+    label: str
+
+
+@dataclass(frozen=True, slots=True)
+class Overlay:
+    """All shapes of one picture, in pixels of the full image."""
+
+    mapped: Outline | None
+    """Blue: the target tree as the map has it."""
+    seen: Outline | None
+    """Green: the target trunk as the depth image has it in this very frame."""
+    others: tuple[Outline, ...]
+    """Thin: the other trees in view."""
+    arrow: tuple[float, float] | None
+    """Direction of the red arrow (right, up), a unit vector; None: no arrow."""
+    docked: bool
+    headline: str
+    """The command in words, with its magnitude."""
+    status: str
+    """State and distance."""
+    warning: str
+    """What is wrong, empty when nothing is."""
+
+
+def overlay_of(
+    intrinsics: Intrinsics,
+    pose: Pose | None,
+    trees: tuple[Tree, ...],
+    target: Target | None,
+    mission: MissionState | None,
+    guidance: Guidance | None,
+) -> Overlay:
+    """Return the shapes for a frame.
+
+    Args:
+        intrinsics: of the full image.
+        pose: at the frame, None or without transform when slam has none.
+        trees: the map's, in map.
+        target: of this frame or one just before.
+        mission: its latest state.
+        guidance: the latest command.
+    """
+    T = None if pose is None or pose.T_map_camera is None else from_transform(pose.T_map_camera)
+    wanted = mission.target_tree_id if mission is not None else None
+    outlines = {} if T is None else {t.id: o for t in trees if (o := trunk_outline(t, inverse(T), intrinsics))}
+    command = guidance.command if guidance is not None else None
+    return Overlay(
+        mapped=outlines.get(wanted) if wanted is not None else None,
+        seen=_seen(target, outlines.get(wanted) if wanted is not None else None, intrinsics),
+        others=tuple(outline for tree_id, outline in outlines.items() if tree_id != wanted),
+        arrow=_ARROWS.get(command) if command else None,
+        docked=command == "docked" or (mission is not None and mission.state == "docked"),
+        headline=_headline(guidance),
+        status=_status(mission),
+        warning=_warning(pose, target, mission),
+    )
+
+
+_ARROWS: dict[str, tuple[float, float]] = {
+    "turn_left": (-1.0, 0.0), "turn_right": (1.0, 0.0), "toward": (0.0, 1.0), "backward": (0.0, -1.0),
+}  # fmt: skip
+
+
+def trunk_outline(tree: Tree, T_camera_map: NDArray[np.float64], i: Intrinsics) -> Outline | None:
+    """Return the quadrangle of a trunk, None when it is behind the camera, out of view or far."""
+    foot, axis = np.array([tree.x_m, tree.y_m, tree.z_m]), np.array(tree.axis)
+    ends = apply(T_camera_map, np.stack([foot + h * axis for h in (_TRUNK_LOW_M, _TRUNK_HIGH_M)]))
+    if ends[:, 2].min() < _NEAR_M or ends[:, 2].max() > _OTHER_WITHIN_M:
+        return None
+    along = ends[1] - ends[0]
+    sideways = np.cross(along, 0.5 * (ends[0] + ends[1]))
+    sideways *= tree.radius_m / max(float(np.linalg.norm(sideways)), 1e-9)
+    corners = np.stack([ends[0] - sideways, ends[0] + sideways, ends[1] + sideways, ends[1] - sideways])
+    pixels = np.stack(
+        [i.fx * corners[:, 0] / corners[:, 2] + i.cx, i.fy * corners[:, 1] / corners[:, 2] + i.cy], axis=1
+    )
+    if (
+        pixels[:, 0].max() < 0
+        or pixels[:, 0].min() > i.width
+        or pixels[:, 1].max() < 0
+        or pixels[:, 1].min() > i.height
+    ):
+        return None
+    low_left, low_right, high_right, high_left = ((float(u), float(v)) for u, v in pixels)
+    if low_left[0] > low_right[0]:
+        low_left, low_right, high_right, high_left = low_right, low_left, high_left, high_right
+    return Outline((low_left, low_right, high_right, high_left), f"{tree.id}  {200.0 * tree.radius_m:.0f} cm")
+
+
+def _seen(target: Target | None, mapped: Outline | None, i: Intrinsics) -> Outline | None:
+    """Return the trunk as the refiner has it: its x, width and range; how high it reaches only the map tells."""
+    if target is None or target.status != "tracking" or target.image_x_px is None:
+        return None
+    if target.range_m is None or target.radius_m is None or target.range_m < target.radius_m + 0.05:
+        return None
+    half = i.fx * math.tan(math.asin(target.radius_m / target.range_m))
+    low, high = (mapped.quad[0][1], mapped.quad[2][1]) if mapped else (0.98 * i.height, 0.02 * i.height)
+    x = target.image_x_px
+    quad = ((x - half, low), (x + half, low), (x + half, high), (x - half, high))
+    guessed = "" if target.measured else " (predicted)"
+    return Outline(quad, f"{target.range_m:.2f} m{guessed}")
+
+
+def _headline(guidance: Guidance | None) -> str:
+    if guidance is None:
+        return ""
+    words = _WORDS[guidance.command]
+    if guidance.unit == "rad":
+        return f"{words} {math.degrees(guidance.magnitude):.0f} deg"
+    if guidance.unit == "m" and guidance.magnitude > 0.0:
+        return f"{words} {guidance.magnitude:.1f} m"
+    return words
+
+
+def _status(mission: MissionState | None) -> str:
+    if mission is None:
+        return ""
+    parts = [mission.state.replace("_", " ")]
+    if mission.target_tree_id is not None:
+        parts.append(f"tree {mission.target_tree_id}")
+    if mission.distance_m is not None:
+        parts.append(f"{mission.distance_m:.2f} m")
+    return "  ".join(parts)
+
+
+def _warning(pose: Pose | None, target: Target | None, mission: MissionState | None) -> str:
+    if mission is not None and mission.failsafe:
+        return mission.failsafe.replace("_", " ")
+    if pose is None or pose.T_map_camera is None:
+        return "no pose" if pose is None else f"slam {pose.status}"
+    if target is not None and target.status == "lost":
+        return "target lost"
+    return ""
