@@ -98,7 +98,7 @@ CAMERA_RGBD = Topic("camera/rgbd", RgbdFrame, "camera", ("slam", "refiner", "nav
                     description="colour and registered depth, raw")  # fmt: skip
 CAMERA_COMPRESSED = Topic("camera/rgbd_compressed", RgbdFrame, "camera", ("recorder",), 0, None, _A, _LATEST, "data_low",
                           description="the same as JPEG and PNG, sent only while somebody listens")  # fmt: skip
-SLAM_POSE = Topic("slam/pose", Pose, "slam", ("refiner", "navigator", "autopilot", "simulator", "station", "preview"), 15, 0.5, _R, _STREAM,
+SLAM_POSE = Topic("slam/pose", Pose, "slam", ("refiner", "detector", "navigator", "autopilot", "simulator", "station", "preview"), 15, 0.5, _R, _STREAM,
                   "interactive_high", radio_hz=5, express=True, description="camera in map for each frame, with covariance")  # fmt: skip
 SLAM_KEYFRAME = Topic("slam/keyframe", Keyframe, "slam", ("mapper",), 0, None, _A, _ADVANCED, "data", cache=64,
                       description="keyframe with compressed depth")  # fmt: skip
@@ -112,7 +112,7 @@ MAP_GROUND = Topic("map/ground", GroundPatch, "mapper", ("recorder",), 0, None, 
                    description="ground per cell as it changes: height, slope, relief; a queryable answers with the whole")  # fmt: skip
 TREES_LIST = Topic("trees/list", TreeList, "detector", ("refiner", "navigator", "station", "preview"), 0, None, _R, _ADVANCED, "data_high",
                    description="all trees known; a queryable answers with the latest")  # fmt: skip
-TREES_TARGET = Topic("trees/target", Target, "refiner", ("navigator", "simulator", "station", "preview"), 15, 0.5, _R, _STREAM,
+TREES_TARGET = Topic("trees/target", Target, "refiner", ("detector", "navigator", "simulator", "station", "preview"), 15, 0.5, _R, _STREAM,
                      "interactive_high", radio_hz=5, express=True, description="the target trunk in the depth image")  # fmt: skip
 MISSION_STATE = Topic("mission/state", MissionState, "navigator", ("refiner", "autopilot", "station", "preview"), 5, 1.0, _R, _STREAM,
                       "interactive_high", radio_hz=5, express=True, description="the mission's state, its reason, the target")  # fmt: skip

@@ -51,12 +51,35 @@ class DetectorConfig(BaseModel):
     seed: int = 1
 
 
+class FusionConfig(BaseModel):
+    """How much the refiner's measurements say beside the cloud."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    min_frames: int = Field(default=3, ge=1)
+    """A view of fewer frames is not believed."""
+    max_views: int = Field(default=64, ge=1)
+    max_shift_m: float = Field(default=0.15, gt=0.0)
+    """A view that would move the tree by more is of another tree, or of another state of the map."""
+    max_radius_m: float = Field(default=0.05, gt=0.0)
+    """The same for the radius."""
+    common_xy_m: float = Field(default=0.008, ge=0.0)
+    """Error that all views share: drift of the poses, the sensor's fixed pattern."""
+    common_radius_m: float = Field(default=0.003, ge=0.0)
+    cloud_xy_m: float = Field(default=0.008, gt=0.0)
+    """At least this is the cloud's own error: many points do not average what they share."""
+    cloud_radius_m: float = Field(default=0.003, gt=0.0)
+    publish_every_s: float = Field(default=1.0, gt=0.0)
+    """The list is sent no more often than this for the refiner's sake alone."""
+
+
 class DetectorServiceConfig(BaseModel):
     """The detector as a service."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     slicing: DetectorConfig = DetectorConfig()
+    fusion: FusionConfig = FusionConfig()
     max_rate_hz: float = Field(default=5.0, gt=0.0)
     """At most so many detections a second of the clock's time."""
     same_tree_m: float = 0.25

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from schemas.codec import Wire
 from schemas.mapping import Submap
-from schemas.topics import MAP_CLOUD, TREES_LIST
-from schemas.trees import Tree, TreeList
+from schemas.topics import MAP_CLOUD, SLAM_POSE, TREES_LIST, TREES_TARGET
+from schemas.trees import Target, Tree, TreeList
 from services.common.context import Context
 from services.detector.config import DetectorServiceConfig
 from services.detector.detect import detect_trees
+from services.detector.fusion import Fusion
 from services.detector.identity import Identities
 from services.detector.map_store import MapStore, anchor_of, moved_with
 from services.detector.model import DetectionResult, Floats
@@ -25,6 +26,9 @@ class DetectorService:
         self._config = config
         self._store = MapStore()
         self._identities = Identities(config)
+        self._fusion = Fusion(config.fusion)
+        self._refined = False
+        """Whether the refiner has said something since the last list."""
         self._anchored: dict[int, Floats] = {}
         """Poses of the submaps at the last detection."""
         self._incomplete = False
@@ -33,6 +37,8 @@ class DetectorService:
         self.result: DetectionResult | None = None
         """Of the last detection, for explanations."""
         context.on(MAP_CLOUD, self.on_submap)
+        context.on(SLAM_POSE, self._fusion.on_pose)
+        context.on(TREES_TARGET, self.on_target)
         context.every(1.0 / config.max_rate_hz, self.on_timer)
         context.answer_state(TREES_LIST, self.state)
 
@@ -43,17 +49,28 @@ class DetectorService:
                 return
             self._store.clear(submap.map_id)
             self._identities.clear()
+            self._fusion.clear(submap.map_id)
             self._anchored = {}
         if not self._store.take(submap):
             self._incomplete = True
 
+    def on_target(self, target: Target) -> None:
+        """Take up what the refiner measured."""
+        if self._fusion.on_target(target):
+            self._context.health.count("refined_frames")
+            self._refined = True
+
     def on_timer(self) -> None:
-        """Detect when the map changed since the last time."""
+        """Detect when the map changed since the last time; else tell of what the refiner found since."""
         if self._incomplete:
             self._fetch_whole_map()
         if self._store.changed_points > 0:
             self._detect()
             self._publish()
+        elif self._refined and self._published is not None:
+            age_s = (self._context.clock.now_ns() - self._published.stamp_ns) * 1e-9
+            if age_s >= self._config.fusion.publish_every_s:
+                self._publish()
 
     def final_trees(self) -> list[Tree]:
         """Return the trees of the map as it is now; those that the last look at it did not confirm are left out."""
@@ -95,9 +112,14 @@ class DetectorService:
 
     def _trees(self, *, confirmed: bool) -> list[Tree]:
         kept = [t for t in self._identities.trees if t.missed == 0 or not confirmed]
-        return [as_tree(t.trunk, t.tree_id, t.observations) for t in sorted(kept, key=lambda t: t.tree_id)]
+        keyframes = self._store.poses()
+        return [
+            self._fusion.corrected(as_tree(t.trunk, t.tree_id, t.observations), keyframes)
+            for t in sorted(kept, key=lambda t: t.tree_id)
+        ]
 
     def _publish(self) -> None:
+        self._refined = False
         trees = tuple(self._trees(confirmed=False))
         last = self._published
         if last is not None and last.map_id == self._store.map_id and not self._news(last.trees, trees):

@@ -157,3 +157,9 @@ def extent(found: Scan, k: int) -> tuple[tuple[float, float], tuple[int, int], f
     kernels_object.object_extent(found.runs, found.label, k, out)
     left, right, first, last, angle = out.tolist()
     return (left, right), (int(first), int(last)), angle
+
+
+def edges_of(found: Scan, k: int) -> NDArray[np.int64]:
+    """Return (N, 3) row, left and right column of an object's edges before background, -1 where there is none."""
+    edges = np.empty((2 * len(found.rows), 3), np.int64)
+    return edges[: kernels_object.object_edges(found.runs, found.label, k, edges)]

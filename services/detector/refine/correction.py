@@ -43,6 +43,14 @@ class Correction:
             (1.0 - weight) * variance,
         )
 
+    def rebased(self, before: ExpectedTree, after: ExpectedTree) -> Correction:
+        """Return the correction of the same tree newly mapped: place and radius as corrected stay what they are.
+
+        The new list may hold what was measured here (the detector fuses it): added once more it would count double.
+        """
+        shift = self.shift_m - np.array([after.x_m - before.x_m, after.y_m - before.y_m])
+        return replace(self, shift_m=shift, radius_m=self.radius_m - (after.radius_m - before.radius_m))
+
     def applied(self, tree: ExpectedTree) -> ExpectedTree:
         """Return the map's tree with the correction."""
         sigma = float(np.sqrt(max(largest_eigenvalue_2x2(self.covariance), _MIN_SIGMA_M**2)))

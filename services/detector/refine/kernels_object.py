@@ -98,3 +98,19 @@ def object_extent(runs: Matrix, label: NDArray[np.int64], wanted: int, extent: M
         left[j], right[j], angle[j] = run[FIRST], run[LAST], run[LEFT_RAD] - run[RIGHT_RAD]
     extent[0], extent[1], extent[4] = _median(left), _median(right), _median(angle)
     extent[2], extent[3] = runs[index[0], ROW], runs[index[n - 1], ROW]
+
+
+@njit(cache=True, nogil=True)
+def object_edges(runs: Matrix, label: NDArray[np.int64], wanted: int, edges: NDArray[np.int64]) -> int:
+    """Fill ``edges`` (N, 3) with row, left and right column where background is seen beside them, else -1; how many."""
+    n = 0
+    for k in range(len(label)):
+        run = runs[k]
+        if label[k] != wanted or n >= edges.shape[0]:
+            continue
+        left = int(run[FIRST]) if run[LEFT_KIND] == SILHOUETTE else -1
+        right = int(run[LAST]) if run[RIGHT_KIND] == SILHOUETTE else -1
+        if left >= 0 or right >= 0:
+            edges[n, 0], edges[n, 1], edges[n, 2] = int(run[ROW]), left, right
+            n += 1
+    return n

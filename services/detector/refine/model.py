@@ -55,6 +55,8 @@ class Measurement:
     rows_px: tuple[int, int]
     shift_m: tuple[float, float]
     """Measured less expected position, map x and y."""
+    edges_px: NDArray[np.int64]
+    """(N, 3) row, left and right column of the trunk's edges in the depth image, -1 where none is seen."""
 
 
 @dataclass(frozen=True, slots=True)

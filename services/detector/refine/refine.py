@@ -10,7 +10,7 @@ import numpy as np
 from schemas.camera import Intrinsics
 from services.detector.refine import kernels_place
 from services.detector.refine.associate import associate
-from services.detector.refine.candidates import Fit, Scan, candidates, extent, fit_object, join_alike, scan
+from services.detector.refine.candidates import Fit, Scan, candidates, edges_of, extent, fit_object, join_alike, scan
 from services.detector.refine.config import RefinerConfig
 from services.detector.refine.model import Depth, ExpectedTree, Matrix, Measurement, Sight
 from services.detector.refine.view import axis_point, gate_m, pose_offset_covariance, project_point, sight, window
@@ -125,5 +125,5 @@ def _measurement(
         position_map_m=(float(position[0]), float(position[1])), covariance_map_m2=covariance[:2, :2] + shift,
         rms=fit.rms, inliers=fit.inliers, inlier_share=fit.inlier_share,
         arc_rad=min(1.0, 0.5 * angle / half) * (math.pi - 2.0 * half), columns_px=columns, rows_px=rows,
-        shift_m=(float(moved[0]), float(moved[1])),
+        shift_m=(float(moved[0]), float(moved[1])), edges_px=edges_of(found, fit.object),
     )  # fmt: skip

@@ -62,6 +62,8 @@ class RefinerTracker:
             before, after = self._trees.get(tree_id), new.get(tree_id)
             if not before or not after or math.hypot(after.x_m - before.x_m, after.y_m - before.y_m) > _MOVED_M:
                 del self._corrections[tree_id]
+            else:
+                self._corrections[tree_id] = self._corrections[tree_id].rebased(before, after)
         self._trees, self._suitable = new, set(suitable)
         if self._target not in self._trees:
             self._forget_target()
