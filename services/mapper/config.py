@@ -38,3 +38,17 @@ class MapperConfig(BaseModel):
     move_m: float = Field(default=0.001, gt=0.0)
     move_rad: float = Field(default=0.0005, gt=0.0)
     """A submap that the graph moved by less is not sent again."""
+    register_clouds: bool = False
+    """Move each keyframe's cloud onto the local submap. Off: slam's poses are better (docs/decisions/mapper.md)."""
+    registration_sigma_m: float = Field(default=0.005, gt=0.0)
+    registration_sigma_rad: float = Field(default=0.001, gt=0.0)
+    """How well slam places a keyframe against its neighbours: what registration may move it by."""
+    registration_views: int = Field(default=64, ge=10)
+    """Reduced views that are kept for it, 0.5 MB each."""
+    ground_cell_model_m: float = Field(default=0.5, ge=0.1)
+    """Cells of the published ground."""
+    state_dir: str = "auto"
+    """Folder in which the map survives a restart; ``off``; ``auto``: $STATE_DIRECTORY, else ~/.local/state/treedock/<uav>,
+    and off where time is simulated."""
+    save_s: float = Field(default=10.0, gt=0.0)
+    """A changed map is written at most so often."""

@@ -1,32 +1,39 @@
-"""The mapper as a service: keyframes and graphs in, submaps out.
+"""The mapper as a service: keyframes and graphs in; submaps, an index of them and the ground out.
 
 ``map/cloud`` carries one submap per message. New or thinned points come with a new ``version``. A submap that the
-graph merely moved is sent with its old version, its new pose and no points; a consumer that does not hold that version
-asks the key for the whole map. ``removed`` withdraws a submap.
+graph merely moved is sent with its old version, its new pose and no points; ``removed`` withdraws a submap.
+``map/index`` says what there is: whoever holds less or older asks ``map/cloud`` for the whole map.
 """
 
 from __future__ import annotations
+
+import os
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.camera import Intrinsics
 from schemas.codec import Wire
-from schemas.mapping import Submap
-from schemas.slam import Graph, Keyframe
-from schemas.topics import MAP_CLOUD, SLAM_GRAPH, SLAM_KEYFRAME
+from schemas.mapping import MapIndex
+from schemas.slam import Graph, Keyframe, Transform
+from schemas.topics import MAP_CLOUD, MAP_GROUND, MAP_INDEX, SLAM_GRAPH, SLAM_KEYFRAME
 from services.camera.codecs import FrameError, decode_colour_image, decode_depth
 from services.common.context import Context
-from services.common.geometry import from_transform
-from services.mapper.cloud import keyframe_cloud, pixel_rays
+from services.common.geometry import from_transform, inverse
+from services.mapper.cloud import KeyframeCloud, keyframe_cloud, pixel_rays
 from services.mapper.config import MapperConfig
 from services.mapper.dense_map import DenseMap, MapCloud, MapSubmap
+from services.mapper.ground_patches import GroundPatches, Occasion
+from services.mapper.keeper import MapKeeper
+from services.mapper.local_submap import LocalSubmap
+from services.mapper.saved_map import SavedMap, as_message, map_file
 
 Matrix = NDArray[np.float64]
 
-_ORIGIN = np.zeros((1, 3), dtype=np.float32)
-_NO_POINTS = np.zeros((0, 3), dtype=np.float32)
-_NO_COLOUR = np.zeros((0, 3), dtype=np.uint8)
+_LOOK_S = 1.0
+_INDEX_S = 5.0
+"""Without any change the index is still told so often, for those who missed the last one."""
 
 
 class MapperService:
@@ -37,12 +44,26 @@ class MapperService:
         self._config = config
         self.map = DenseMap(config)
         self._graph_version = 0
+        self._nodes: dict[int, Transform] = {}
         self._poses: dict[int, Matrix] = {}
         """Of the latest graph."""
         self._rays: tuple[Intrinsics, NDArray[np.float32]] | None = None
+        self._local = LocalSubmap(config)
+        self._ground = GroundPatches(config.ground_cell_model_m)
+        self._epoch = context.clock.now_ns()
+        self._index_due_ns = 0
+        self._news, self._unsaved = False, False
+        file = map_file(config.state_dir, context.uav, dict(os.environ), simulated=context.clock.simulated)
+        self._keeper = None if file is None else MapKeeper(file, context.health.count, context.health.note)
+        self._saved: SavedMap | None = None if self._keeper is None else self._keeper.load()
         context.on(SLAM_KEYFRAME, self.on_keyframe)
         context.on(SLAM_GRAPH, self.on_graph)
+        context.every(_LOOK_S, self.on_timer)
         context.answer_state(MAP_CLOUD, self.whole_map)
+        context.answer_state(MAP_GROUND, lambda: list(self._ground.whole(self._occasion())))
+        if self._keeper is not None:
+            context.every_wall(config.save_s, self._save_now_and_then)
+            context.on_stop(self._on_stop)
 
     def cloud(self) -> MapCloud:
         """Return the whole map in the map frame."""
@@ -67,38 +88,113 @@ class MapperService:
         if keyframe.graph_version < self._graph_version:
             T = self._poses.get(keyframe.keyframe_id, T)
         self._graph_version = max(self._graph_version, keyframe.graph_version)
-        with self._context.health.timed("insert"):
-            changed = self.map.add(keyframe.keyframe_id, keyframe.stamp_ns, cloud, T)
         self._context.health.count("keyframes")
-        for submap in changed:
-            self._publish(submap, points=True)
+        self._tell(self._add(keyframe, depth_m, rays, cloud, T), points=True)
 
     def on_graph(self, graph: Graph) -> None:
         """Move the submaps to where the graph now puts their keyframes; an older graph is ignored."""
         self._follow_map(graph.map_id)
         if graph.version < self._graph_version:
+            self._saved = None  # slam began again under an old name
             return
         self._graph_version = graph.version
-        self._poses = {node.keyframe_id: from_transform(node.T_map_camera) for node in graph.nodes}
+        self._poses = self._read_poses(graph)
+        self._restore(self._poses)
         with self._context.health.timed("move"):
             moves = self.map.move(self._poses)
-        for submap in moves.moved:
-            self._publish(submap, points=False)
-        for submap in moves.thinned:
-            self._publish(submap, points=True)
+        self._tell(moves.moved, points=False)
+        self._tell(moves.thinned, points=True)
+
+    def on_timer(self) -> None:
+        """Tell the ground that changed, and what the map holds."""
+        if not self.map.map_id:
+            return
+        with self._context.health.timed("ground"):
+            patches = self._ground.changes(self.map.submaps, self._occasion())
+        for patch in patches:
+            self._context.publish(MAP_GROUND, patch)
+        now_ns = self._context.clock.now_ns()
+        if not self._news and now_ns < self._index_due_ns:
+            return
+        self._news, self._index_due_ns = False, now_ns + round(_INDEX_S * 1e9)
+        self._context.publish(MAP_INDEX, self.index())
+
+    def index(self) -> MapIndex:
+        """Return what the map holds."""
+        held = [s for s in self.map.submaps.values() if len(s.points_m)]
+        return MapIndex(
+            stamp_ns=self._context.clock.now_ns(), map_id=self.map.map_id, epoch=self._epoch,
+            graph_version=self._graph_version, submap_ids=tuple(s.submap_id for s in held),
+            versions=tuple(s.version for s in held), placed_by=tuple(s.sent_graph for s in held),
+            ground_sequence=self._ground.sequence,
+        )  # fmt: skip
 
     def whole_map(self) -> list[Wire]:
         """Return every submap with its points."""
-        return [self._message(s, points=True) for s in self.map.submaps.values()]
+        version = self._graph_version
+        return [as_message(s, self.map.map_id, version, points=True) for s in self.map.submaps.values() if len(s.points_m)]  # fmt: skip
+
+    def _add(
+        self,
+        keyframe: Keyframe,
+        depth_m: NDArray[np.float32],
+        rays: NDArray[np.float32],
+        cloud: KeyframeCloud,
+        T: Matrix,
+    ) -> list[MapSubmap]:
+        """Enter a cloud, moved onto the local submap where that is wanted and does good."""
+        health, number = self._context.health, keyframe.keyframe_id
+        if not self._config.register_clouds:
+            with health.timed("insert"):
+                return self.map.add(number, keyframe.stamp_ns, cloud, T)
+        with health.timed("register"):
+            view = self._local.view(depth_m, rays, keyframe.intrinsics)
+            result = self._local.register(view, T, self.map.submaps)
+        health.count("registered" if result.accepted else "not_registered")
+        with health.timed("insert"):
+            changed = self.map.add(number, keyframe.stamp_ns, cloud, T, inverse(T) @ result.T_correction @ T)
+        self._local.keep(number, view, self.map.submaps)
+        return changed
+
+    def _occasion(self) -> Occasion:
+        return Occasion(self._context.clock.now_ns(), self.map.map_id, self._graph_version)
+
+    def _read_poses(self, graph: Graph) -> dict[int, Matrix]:
+        """Return the poses of a graph; those that did not change are not made again."""
+        nodes = {node.keyframe_id: node.T_map_camera for node in graph.nodes}
+        known = self._nodes
+        poses = {
+            k: self._poses[k] if k in self._poses and _same(known[k], T) else from_transform(T)
+            for k, T in nodes.items()
+        }
+        self._nodes = nodes
+        return poses
 
     def _follow_map(self, map_id: str) -> None:
         if map_id == self.map.map_id:
             return
         old = self.map.map_id
         gone = self.map.reset(map_id)
-        self._graph_version, self._poses = 0, {}
+        self._graph_version, self._poses, self._nodes = 0, {}, {}
+        self._local.clear()
+        self._ground.model.clear()
+        self._news = True
+        if self._saved is not None and self._saved.map_id != map_id:
+            self._saved = None
         for submap in gone:
-            self._context.publish(MAP_CLOUD, self._message(submap, points=False, map_id=old, removed=True))
+            self._context.publish(MAP_CLOUD, as_message(submap, old, 0, points=False, removed=True))
+
+    def _restore(self, poses: Mapping[int, Matrix]) -> None:
+        """Take up the saved map when slam still works on it: the same name, a later graph, most keyframes still in it."""
+        saved, self._saved = self._saved, None
+        if saved is None or saved.map_id != self.map.map_id or saved.graph_version > self._graph_version:
+            return
+        if 2 * sum(s.anchor_id in poses for s in saved.submaps) < len(saved.submaps):
+            return
+        back = [s for s in saved.submaps if s.submap_id not in self.map.submaps]
+        self.map.restore(back)
+        self._context.health.count("submaps_restored", len(back))
+        self._tell(back, points=True)
 
     def _images(self, keyframe: Keyframe) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None, NDArray[np.float32]]:
         i = keyframe.intrinsics
@@ -112,18 +208,41 @@ class MapperService:
             rgb = np.ascontiguousarray(bgr[:, :, ::-1])
         return depth_m, rgb, self._rays[1]
 
-    def _publish(self, submap: MapSubmap, *, points: bool) -> None:
-        self._context.health.count("submaps_sent" if points else "submaps_moved")
-        self._context.publish(MAP_CLOUD, self._message(submap, points=points))
+    def _tell(self, submaps: list[MapSubmap], *, points: bool) -> None:
+        """Publish submaps that changed; one that lost its last point is withdrawn."""
+        self._ground.model.touch(submaps)
+        self._news |= bool(submaps)
+        self._unsaved |= bool(submaps)
+        for submap in submaps:
+            if len(submap.points_m) == 0 and (not points or submap.version == 1):
+                continue
+            self._context.health.count("submaps_sent" if points else "submaps_moved")
+            submap.sent_graph = self._graph_version
+            removed = len(submap.points_m) == 0
+            self._context.publish(
+                MAP_CLOUD,
+                as_message(submap, self.map.map_id, self._graph_version, points=points, removed=removed),
+            )
 
-    def _message(self, submap: MapSubmap, *, points: bool, map_id: str = "", removed: bool = False) -> Submap:
-        n = len(submap.points_m) if points else 0
-        return Submap(
-            map_id=map_id or self.map.map_id, submap_id=submap.submap_id, version=submap.version,
-            graph_version=self._graph_version, stamp_ns=submap.stamp_ns, T_map_submap=submap.T_map_submap.copy(),
-            points_m=submap.points_m if points else _NO_POINTS, view=np.zeros(n, dtype=np.uint16), origins_m=_ORIGIN,
-            colour=submap.rgb if points else _NO_COLOUR, removed=removed,
-        )  # fmt: skip
+    def _save(self) -> bool:
+        assert self._keeper is not None
+        self._keeper.look()
+        if not self._unsaved or not self.map.submaps:
+            return True
+        begun = self._keeper.save(self.map.map_id, self._graph_version, list(self.map.submaps.values()))
+        self._unsaved = not begun
+        return begun
+
+    def _save_now_and_then(self) -> None:
+        self._save()
+
+    def _on_stop(self) -> None:
+        assert self._keeper is not None
+        self._keeper.finish(self._save)
+
+
+def _same(a: Transform, b: Transform) -> bool:
+    return a.position_m == b.position_m and a.quaternion_xyzw == b.quaternion_xyzw
 
 
 def build(context: Context) -> MapperService:

@@ -20,7 +20,7 @@ _START_SLOTS = 1 << 16
 
 
 @njit(cache=True, nogil=True)
-def _slot(key: int, table_keys: Keys) -> int:
+def _slot(key: np.int64, table_keys: Keys) -> int:
     mask = table_keys.shape[0] - 1
     at = (key * np.int64(-7046029254386353131) >> 20) & mask
     while table_keys[at] != -1 and table_keys[at] != key:
@@ -103,6 +103,8 @@ class VoxelTable:
 
     def __init__(self, config: MapperConfig) -> None:
         self._config = config
+        self._used = 0
+        """Slots that carry a key, live or given back."""
         self._clear(_START_SLOTS)
 
     @property
@@ -116,7 +118,8 @@ class VoxelTable:
         """Enter points (N, 3); return which of them got in, and the voxel of each.
 
         Args:
-            points_m: in the frame that ``T_map_points`` takes to map; its origin is where they were seen from.
+            points_m: in the frame of their camera.
+            T_map_points: takes them to map.
             lows_m: lowest heights per cell of the map (``GroundGrid``).
         """
         n = len(points_m)
@@ -155,4 +158,3 @@ class VoxelTable:
         self._counts = np.zeros(slots, dtype=np.uint8)
         self._ranges = np.zeros(slots, dtype=np.float32)
         self._used = 0
-        """Slots that carry a key, live or given back."""

@@ -82,8 +82,8 @@ def test_a_moved_submap_is_sent_without_points() -> None:
 def test_looking_twice_costs_no_memory() -> None:
     system = _Listener()
     (first,) = system.send(_keyframe(1, AHEAD))
-    (again,) = system.send(_keyframe(2, AHEAD))
-    assert len(again.points_m) < 0.05 * len(first.points_m)
+    again = system.send(_keyframe(2, AHEAD))
+    assert sum(len(s.points_m) for s in again) < 0.05 * len(first.points_m)
     assert system.send(_keyframe(2, AHEAD)) == [], "the same keyframe again is no news"
 
 
