@@ -16,6 +16,8 @@ Level = Literal["none", "good", "late", "lost"]
 LINK_LATE_S = 1.0
 LINK_LOST_S = 1.5
 """Within 2 s of the last message the operator must know: 1.5 s here, and the page is told five times a second."""
+LINK_TOPICS = ("slam/pose", "mission/state", "vehicle/state", "trees/target")
+"""What only comes from aboard: mapper, detector and routers may run on the ground, and say nothing of the link."""
 _RATE_OVER_S = 4.0
 
 
@@ -83,8 +85,8 @@ class LinkAges:
         return None if entry is None else entry.age_s(now_s)
 
     def link_age_s(self, now_s: float) -> float | None:
-        """Return the seconds since anything at all came from the aircraft."""
-        ages = [entry.age_s(now_s) for entry in self.arrivals.values()]
+        """Return the seconds since anything that is sent from aboard all the time came."""
+        ages = [self.age_s(name, now_s) for name in LINK_TOPICS]
         return min((age for age in ages if age is not None), default=None)
 
     def link(self, now_s: float) -> Level:

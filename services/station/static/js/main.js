@@ -32,6 +32,7 @@ class Page {
       welcome: (m) => this.onWelcome(m),
       binary: (data) => this.onBinary(data),
     });
+    this.phone = matchMedia("(max-width: 760px)");
     this.buttons();
     this.theme(localStorage.getItem("treedock.theme") || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
     setInterval(() => this.drawWords(), WORDS_MS);
@@ -171,6 +172,7 @@ class Page {
       $("preview-image").removeAttribute("src");
     }
     $("grid").hidden = !this.grid;
+    set(document.body, "data-grid", this.grid ? "true" : null);
     this.drawWords();
   }
 
@@ -241,6 +243,7 @@ class Page {
 
   drawWords() {
     const now = performance.now(), craft = this.craft;
+    this.map.inset = this.phone.matches ? { top: 0, bottom: 0, right: 60 } : { top: Math.min(112, innerHeight * 0.15), bottom: 44, right: 0 };
     this.drawFleet(now);
     if (this.grid) this.drawTiles(now);
     this.drawMission(craft, now);
@@ -287,6 +290,7 @@ class Page {
       const [dot, name, right, reason] = node.firstChild.children, link = c.link(now), v = c.view;
       set(dot, "data-level", link);
       set(node, "data-level", link);
+      set(node, "aria-current", c === this.craft ? "true" : null);
       text(name, c.uav);
       text(right, v?.vehicle?.battery == null ? "" : `${Math.round(v.vehicle.battery * 100)} %`);
       text(reason, link === "lost" ? `link lost, ${duration(c.linkAge(now))}` : v?.mission ? `${TITLES[v.mission.state] ?? words(v.mission.state)}: ${v.mission.reason}` : "no mission is heard");

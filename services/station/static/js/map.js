@@ -25,6 +25,7 @@ export class MapView {
     this.fitted = true; // as long as nobody moved it, it keeps everything in view
     this.craft = null;
     this.selected = null;
+    this.inset = { top: 0, bottom: 0, right: 0 }; // covered by what lies over the map
     this.colours = palette();
     this.dirty = true;
     if (!bare) this.listen();
@@ -152,11 +153,11 @@ export class MapView {
     if (at) points.push([at.x, at.y]);
     const xs = points.map((p) => p[0]), ys = points.map((p) => p[1]);
     const box = { x0: Math.min(...xs), x1: Math.max(...xs), y0: Math.min(...ys), y1: Math.max(...ys) };
-    const margin = this.bare ? 12 : 46;
-    const top = this.bare ? 0 : Math.min(110, this.height * 0.2); // the mission's card
-    const scale = Math.min((this.width - 2 * margin) / Math.max(8, box.y1 - box.y0), (this.height - 2 * margin - top) / Math.max(8, box.x1 - box.x0));
+    const margin = this.bare ? 12 : 34;
+    const { top, bottom } = this.inset;
+    const scale = Math.min((this.width - 2 * margin) / Math.max(8, box.y1 - box.y0), (this.height - 2 * margin - top - bottom) / Math.max(8, box.x1 - box.x0));
     this.scale = Math.min(MAX_SCALE, Math.max(MIN_SCALE * 0.5, scale));
-    this.centre = { x: (box.x0 + box.x1) / 2 + top / 2 / this.scale, y: (box.y0 + box.y1) / 2 };
+    this.centre = { x: (box.x0 + box.x1) / 2 + (top - bottom) / 2 / this.scale, y: (box.y0 + box.y1) / 2 };
   }
 
   // -- drawing
@@ -347,7 +348,7 @@ export class MapView {
 
   drawScale(c) {
     const metres = [0.5, 1, 2, 5, 10, 20, 50].find((m) => m * this.scale > 70) ?? 50, w = metres * this.scale;
-    const u = this.width - w - 18, v = this.height - 62;
+    const u = this.width - w - 18 - this.inset.right, v = this.height - 18 - this.inset.bottom;
     c.strokeStyle = c.fillStyle = this.colours.ink;
     c.lineWidth = 3;
     c.beginPath();

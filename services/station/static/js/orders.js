@@ -5,14 +5,17 @@ import { HOLD_MS, onHold } from "./hold.js";
 
 const GROUNDED = ["idle", "landed", "failed", "released"];
 
+const STOPPING = ["hold", "land", "abort"]; // may always be tried: perhaps the aircraft still hears us
+const OLD_S = 3;
+
 /** name, label, what it does, look, whether it must be held, and why it makes no sense now (or nothing). */
 const ORDERS = [
-  { name: "start", label: "START", hint: "hold to fly", kind: "go", ms: HOLD_MS, not: (s) => (GROUNDED.includes(s) ? "" : `a mission is under way: ${s}`) },
-  { name: "hold", label: "HOLD", hint: "stops at once", kind: "pause", ms: 0, not: (s) => (GROUNDED.includes(s) ? "nothing flies" : "") },
-  { name: "resume", label: "RESUME", hint: "hold to go on", kind: "", ms: HOLD_MS, not: (s) => (s === "hold" ? "" : "nothing to resume") },
-  { name: "next", label: "NEXT TREE", hint: "hold to leave", kind: "", ms: HOLD_MS, not: (s) => (["face", "approach", "dock", "docked"].includes(s) ? "" : "no target to leave") },
-  { name: "land", label: "LAND", hint: "hold to land here", kind: "land", ms: HOLD_MS, not: (s) => (GROUNDED.includes(s) ? "it is on the ground" : s === "landing" ? "it is landing" : "") },
-  { name: "abort", label: "ABORT", hint: "hold to break off", kind: "stop", ms: HOLD_MS, not: (s) => (GROUNDED.includes(s) ? "no mission is under way" : "") },
+  { name: "start", label: "START", hint: "hold 1 s", kind: "go", ms: HOLD_MS, not: (s) => (GROUNDED.includes(s) ? "" : `a mission is under way: ${s}`) },
+  { name: "hold", label: "HOLD", hint: "at once", kind: "pause", ms: 0, not: (s) => (GROUNDED.includes(s) ? "nothing flies" : "") },
+  { name: "resume", label: "RESUME", hint: "hold 1 s", kind: "", ms: HOLD_MS, not: (s) => (s === "hold" ? "" : "nothing to resume") },
+  { name: "next", label: "NEXT TREE", hint: "hold 1 s", kind: "", ms: HOLD_MS, not: (s) => (["face", "approach", "dock", "docked"].includes(s) ? "" : "no target to leave") },
+  { name: "land", label: "LAND", hint: "hold 1 s", kind: "land", ms: HOLD_MS, not: (s) => (GROUNDED.includes(s) ? "it is on the ground" : s === "landing" ? "it is landing" : "") },
+  { name: "abort", label: "ABORT", hint: "hold 1 s", kind: "stop", ms: HOLD_MS, not: (s) => (GROUNDED.includes(s) ? "no mission is under way" : "") },
 ];
 
 export class OrderBar {
@@ -20,7 +23,7 @@ export class OrderBar {
     this.page = page;
     this.nodes = new Map();
     for (const order of ORDERS) {
-      const node = el("button", { class: "order", id: `order-${order.name}`, "data-kind": order.kind }, el("span", {}, order.label), el("small", {}, order.hint));
+      const node = el("button", { class: "order", id: `order-${order.name}`, "data-kind": order.kind, "aria-disabled": "true" }, el("span", {}, order.label), el("small", {}, order.hint));
       onHold(node, () => this.press(order), () => page.toast("info", `Keep ${order.label} pressed for one second.`), order.ms);
       this.nodes.set(order.name, node);
       $("buttons").append(node);
@@ -39,9 +42,10 @@ export class OrderBar {
     if (!craft?.view) return "no aircraft is heard";
     const commander = craft.view.commander;
     if (order.name !== "hold" && commander && commander.n !== this.page.me?.n) return `${commander.name} is in command: take command first`;
-    const state = craft.view.mission?.state;
-    if (!state) return "no mission is heard: is the navigator running?";
-    return order.not(state);
+    const now = performance.now(), age = craft.age(craft.view.mission?.age, now);
+    if (age === null) return "no mission is heard: is the navigator running?";
+    if (age > OLD_S) return STOPPING.includes(order.name) ? "" : `the mission was last heard ${Math.round(age)} s ago`;
+    return order.not(craft.view.mission.state);
   }
 
   async press(order, treeId = null) {
