@@ -137,7 +137,7 @@ class Page {
       };
     }
     addEventListener("keydown", (e) => {
-      if (e.key.toLowerCase() === "h" && !e.repeat && !e.ctrlKey && !e.metaKey && !e.altKey && !(e.target instanceof HTMLInputElement)) this.orders.nodes.get("hold").dispatchEvent(new PointerEvent("pointerdown", { button: 0, pointerId: 0 }));
+      if (e.key.toLowerCase() === "h" && !e.repeat && !e.ctrlKey && !e.metaKey && !e.altKey && !(e.target instanceof HTMLInputElement)) this.orders.holdNow();
     });
   }
 

@@ -48,8 +48,13 @@ export class OrderBar {
     return order.not(craft.view.mission.state);
   }
 
+  /** HOLD by its key: at once, as its button does. */
+  holdNow() {
+    this.press(ORDERS.find((order) => order.name === "hold"));
+  }
+
   async press(order, treeId = null) {
-    const { craft, link, page } = { craft: this.page.craft, link: this.page.link, page: this.page };
+    const page = this.page, { craft, link } = page;
     const why = this.why(order);
     if (why) {
       page.toast("bad", `${order.label}: ${why}.`);
