@@ -7,11 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from services.common.kernels import solve_positive
 from services.detector.config import DetectorConfig
+from services.detector.halves import both_halves
 from services.detector.model import Floats, Ints
-from services.detector.ray import point_sigma, residual, solve
-from services.detector.seeds import best_seed
-from services.detector.voxels import Voxels
+from services.detector.ray import point_sigma, residual
+from services.detector.seeds import GOOD, best_seed, circle_score
+from services.detector.voxels import Slices
 
 _COLUMNS = 10
 """layer, x, y, z, radius, noise, points on, points inside, arc, range."""
@@ -20,6 +22,12 @@ _MOST = 240
 """Points of one circle that its fit uses at most; the joint fit of the trunk uses more."""
 BINS = 36
 """Bins of the arc coverage, 10 degrees each."""
+_PLENTY = 200
+_SKIP = 3
+"""Of a cluster of so many points every second is taken, of twice as many every third: the joint fit uses them all."""
+_TURNS = 6
+_SURE = 12.0
+"""A circle from below with such a score, and as good as it was there, needs no rival."""
 
 
 @njit(cache=True, nogil=True)
@@ -44,26 +52,21 @@ def _neighbourhood(P: Floats, S: Floats, left: Ints, n: int, c: Floats, near: In
 
 
 @njit(cache=True, nogil=True)
-def _normal_step(
-    P: Floats, U: Floats, near: Ints, m: int, c: Floats, e: Floats, sigma: Floats, scale: float, x: Floats
-) -> None:
+def _normal_step(J: Floats, m: int, e: Floats, sigma: Floats, scale: float, x: Floats) -> None:
     """Write the Gauss-Newton step of the circle to ``x`` (Tukey weights, a little damping)."""
-    J, A, y = np.empty(3), np.zeros((3, 3)), np.zeros(3)
+    A, y = np.zeros((3, 3)), np.zeros(3)
     for q in range(m):
         t = e[q] / (4.0 * scale)
         if abs(t) >= 1.0:
             continue
-        i = near[q]
-        residual(P[i, 0], P[i, 1], U[i, 0], U[i, 1], c[0], c[1], c[2], J)
-        w = (1.0 - t * t) ** 2
+        w = (1.0 - t * t) ** 2 / sigma[q]
         for a in range(3):
-            y[a] -= w * e[q] * J[a] / sigma[q]
-            for b in range(3):
-                A[a, b] += w * J[a] * J[b] / (sigma[q] * sigma[q])
+            y[a] -= w * e[q] * J[q, a]
+            for b in range(a + 1):
+                A[a, b] += w * J[q, a] * J[q, b] / sigma[q]
     for a in range(3):
-        A[a, a] *= 1.0 + 1e-3
-        A[a, a] += 1e-6
-    solve(A, y, x)
+        A[a, a] = A[a, a] * (1.0 + 1e-3) + 1e-6
+    solve_positive(A, y, x)
 
 
 @njit(cache=True, nogil=True)
@@ -74,30 +77,30 @@ def _refine(
 
     The scale factor multiplies the expected noise of each point to give the observed one.
     """
-    J, x = np.empty(3), np.empty(3)
+    J, x = np.empty((m, 3)), np.empty(3)
     e, sigma, size = np.empty(m), np.empty(m), np.empty(m)
     scale = 3.0
-    for _ in range(8):
+    for _ in range(_TURNS):
         held = 0
         for q in range(m):
             i = near[q]
             ray = U[i, 0] != 0.0 or U[i, 1] != 0.0
             s = ((c[0] - P[i, 0]) * U[i, 1] - (c[1] - P[i, 1]) * U[i, 0]) / c[2]
             sigma[q] = point_sigma(s, G[i], ray, k_range, surface)
-            e[q] = residual(P[i, 0], P[i, 1], U[i, 0], U[i, 1], c[0], c[1], c[2], J) / sigma[q]
+            e[q] = residual(P[i, 0], P[i, 1], U[i, 0], U[i, 1], c[0], c[1], c[2], J[q]) / sigma[q]
             if abs(e[q]) < 4.5 * scale:
                 size[held] = abs(e[q])
                 held += 1
         if held < 4:
             return -1.0
         scale = max(1.0, 1.4826 * np.median(size[:held]))
-        _normal_step(P, U, near, m, c, e, sigma, scale, x)
+        _normal_step(J, m, e, sigma, scale, x)
         step = np.sqrt(x[0] ** 2 + x[1] ** 2 + x[2] ** 2)
         limit = min(1.0, 0.5 * c[2] / max(step, 1e-12))
         for a in range(3):
             c[a] += limit * x[a]
         c[2] = min(max(c[2], 0.5 * r_min), 1.5 * r_max)
-        if step < 1e-4:
+        if step < 2e-4:
             break
     return scale
 
@@ -142,12 +145,12 @@ def _judge(
 
 @njit(cache=True, nogil=True)
 def _load(
-    xyz: Floats, ray: Floats, members: Ints, k_range: float, surface: float, spacing: float, P: Floats, U: Floats,
-    G: Floats, S: Floats,
-) -> None:  # fmt: skip
+    xyz: Floats, ray: Floats, begin: int, end: int, every: int, k_range: float, surface: float, spacing: float, P: Floats,
+    U: Floats, G: Floats, S: Floats,
+) -> int:  # fmt: skip
     """Copy a cluster's points, unit rays in the plan, ranges, and how far a point may be from a seed circle."""
-    for q in range(members.shape[0]):
-        v = members[q]
+    q = 0
+    for v in range(begin, end, every):
         flat = np.sqrt(ray[v, 0] ** 2 + ray[v, 1] ** 2)
         G[q] = np.sqrt(flat * flat + ray[v, 2] ** 2)
         for a in range(3):
@@ -155,25 +158,54 @@ def _load(
         for a in range(2):
             U[q, a] = ray[v, a] / flat if flat > 1e-6 else 0.0
         S[q] = 2.0 * np.sqrt((k_range * G[q] ** 2) ** 2 + surface * surface) + 0.25 * spacing
+        q += 1
+    return q
+
+
+@njit(cache=True, nogil=True)
+def _from_below(
+    P: Floats, U: Floats, S: Floats, left: Ints, n: int, known: Floats, rows: int, level: float, best: Floats
+) -> bool:
+    """Try the circles of the two slices below (rows of ``known``): most trunks go on. Tell whether one is good enough."""
+    x0, x1, y0, y1 = 1e30, -1e30, 1e30, -1e30
+    for q in range(n):
+        i = left[q]
+        x0, x1 = min(x0, P[i, 0]), max(x1, P[i, 0])
+        y0, y1 = min(y0, P[i, 1]), max(y1, P[i, 1])
+    top, enough = 0.0, 1e30
+    for k in range(rows - 1, -1, -1):
+        if known[k, 0] < level - 2.0:
+            break
+        r = known[k, 4]
+        if known[k, 0] >= level or not (x0 - r < known[k, 1] < x1 + r and y0 - r < known[k, 2] < y1 + r):
+            continue
+        c = np.array([known[k, 1], known[k, 2], r])
+        score = circle_score(P, U, S, left, n, c, top)
+        if score > top:
+            top, enough = score, GOOD * known[k, 6]
+            best[:] = c
+    return top > min(GOOD * n, max(enough, _SURE))
 
 
 @njit(cache=True, nogil=True)
 def _circles_of_cluster(
     P: Floats, U: Floats, G: Floats, S: Floats, n: int, k_range: float, surface: float, r_min: float, r_max: float,
-    min_points: int, trials: int, state: Ints, out: Floats,
+    min_points: int, trials: int, state: Ints, known: Floats, before: int, level: float, out: Floats,
 ) -> int:  # fmt: skip
     """Take circle after circle out of a cluster; fill rows of ``out`` and return their number."""
     left, taken, near = np.arange(n), np.empty(n, dtype=np.int64), np.empty(_MOST, dtype=np.int64)
     circle = np.empty(3)
     rows, first = 0, n
     while rows < out.shape[0] and n >= max(min_points, 0.1 * first):
-        if best_seed(P, U, S, left, n, state, trials, r_min, r_max, circle) < 0.5 * min_points:
+        sure = _from_below(P, U, S, left, n, known, before, level, circle)
+        if not sure and best_seed(P, U, S, left, n, state, trials, r_min, r_max, circle) < 0.5 * min_points:
             break
         m = _neighbourhood(P, S, left, n, circle, near)
         scale = _refine(P, U, G, near, m, circle, k_range, surface, r_min, r_max)
         if scale < 0.0:
             break
         on = _judge(P, U, G, left, n, circle, scale, k_range, surface, out[rows], taken)
+        out[rows, 0] = level
         out[rows, 9] = G[left[0]]
         good = on >= min_points and r_min <= circle[2] <= r_max
         rows += 1 if good else 0
@@ -190,26 +222,27 @@ def _circles_of_cluster(
 
 @njit(cache=True, nogil=True)
 def _all_slices(
-    xyz: Floats, ray: Floats, order: Ints, begin: Ints, z_low: float, layer_m: float, k_range: float, surface: float,
-    spacing: float, r_min: float, r_max: float, min_points: int, trials: int, seed: int, out: Floats,
+    xyz: Floats, ray: Floats, begin: Ints, from_cluster: int, to_cluster: int, z_low: float, layer_m: float, k_range: float,
+    surface: float, spacing: float, r_min: float, r_max: float, min_points: int, trials: int, seed: int, out: Floats,
 ) -> int:  # fmt: skip
     rows, largest = 0, 0
-    for c in range(begin.shape[0] - 1):
+    for c in range(from_cluster, to_cluster):
         largest = max(largest, begin[c + 1] - begin[c])
     P, U, G, S = np.empty((largest, 3)), np.empty((largest, 2)), np.empty(largest), np.empty(largest)
     state = np.empty(1, dtype=np.int64)
-    for c in range(begin.shape[0] - 1):
-        n = begin[c + 1] - begin[c]
-        if n < min_points:
+    for c in range(from_cluster, to_cluster):
+        size = begin[c + 1] - begin[c]
+        if size < min_points:
             continue
         state[0] = seed + 7919 * c
-        _load(xyz, ray, order[begin[c] : begin[c + 1]], k_range, surface, spacing, P, U, G, S)
-        tries = trials if n < 400 else 2 * trials
+        every = min(_SKIP, 1 + size // _PLENTY)
+        n = _load(xyz, ray, begin[c], begin[c + 1], every, k_range, surface, spacing, P, U, G, S)
+        tries = trials if size < 2 * _PLENTY else 2 * trials
+        level = np.floor((P[0, 2] - z_low) / layer_m)
         room = out[rows : min(rows + _PER_CLUSTER, out.shape[0])]
-        found = _circles_of_cluster(P, U, G, S, n, k_range, surface, r_min, r_max, min_points, tries, state, room)
-        for k in range(found):
-            room[k, 0] = np.floor((P[0, 2] - z_low) / layer_m)
-        rows += found
+        rows += _circles_of_cluster(
+            P, U, G, S, n, k_range, surface, r_min, r_max, min_points, tries, state, out, rows, level, room
+        )  # fmt: skip
     return rows
 
 
@@ -228,20 +261,27 @@ class Circles:
     range_m: Floats
 
 
-def fit_slices(
-    voxels: Voxels, order: Ints, begin: Ints, low: Floats, spacing_m: float, layer_m: float, config: DetectorConfig
-) -> Circles:
-    """Return the circles found in every cluster of every layer (several where a cluster holds several)."""
-    clusters = int(np.count_nonzero(np.diff(begin) >= config.min_slice_points))
-    out = np.zeros((_PER_CLUSTER * clusters + 8, _COLUMNS))
-    rows = int(
-        _all_slices(
-            voxels.xyz_m, voxels.ray_m, order, begin, float(low[2]), layer_m, config.range_noise_per_m,
-            config.surface_noise_m, spacing_m, config.min_radius_m, config.max_radius_m, config.min_slice_points,
+def fit_slices(slices: Slices, low: Floats, config: DetectorConfig) -> Circles:
+    """Return the circles found in every cluster of every slice (several where a cluster holds several)."""
+    begin, voxels = slices.begin, slices.voxels
+    last = len(begin) - 1
+    split = _split(slices, float(low[2]))
+    ends = ((0, split), (split, last))
+    outs: list[Floats] = [np.zeros((0, _COLUMNS)), np.zeros((0, _COLUMNS))]
+
+    def work(half: int) -> None:
+        first, end = ends[half]
+        clusters = int(np.count_nonzero(np.diff(begin[first : end + 1]) >= config.min_slice_points))
+        out = np.zeros((_PER_CLUSTER * clusters + 8, _COLUMNS))
+        rows = _all_slices(
+            voxels.xyz_m, voxels.ray_m, begin, first, end, float(low[2]), slices.layer_m, config.range_noise_per_m,
+            config.surface_noise_m, slices.spacing_m, config.min_radius_m, config.max_radius_m, config.min_slice_points,
             config.trials, config.seed, out,
-        )
-    )  # fmt: skip
-    out = out[:rows]
+        )  # fmt: skip
+        outs[half] = out[: int(rows)]
+
+    both_halves(work, 20 * len(voxels.xyz_m))
+    out = np.concatenate(outs)
     keep = (out[:, 7] <= 0.6 * out[:, 6]) & (out[:, 8] >= 0.7 * config.min_arc_rad)
     keep &= (out[:, 5] <= 0.5 * out[:, 4]) | (out[:, 9] > 0.0)
     out = out[keep]
@@ -249,3 +289,11 @@ def fit_slices(
         out[:, 0].astype(np.int64), np.ascontiguousarray(out[:, 1:4]), np.ascontiguousarray(out[:, 4]), out[:, 5].copy(),
         out[:, 6].astype(np.int64), out[:, 7].astype(np.int64), out[:, 8].copy(), out[:, 9].copy(),
     )  # fmt: skip
+
+
+def _split(slices: Slices, z_low: float) -> int:
+    """Return the first cluster of the upper half of the slices' voxels, at the border of a slice."""
+    begin = slices.begin
+    cluster = int(np.searchsorted(begin, begin[-1] // 2))
+    level = np.floor((slices.voxels.xyz_m[begin[:-1], 2] - z_low) / slices.layer_m) if len(begin) > 1 else np.zeros(0)
+    return int(np.searchsorted(level, level[min(cluster, len(level) - 1)])) if len(level) else 0

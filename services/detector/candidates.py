@@ -10,9 +10,10 @@ from services.detector.checks import axis_at, base_point, prolonged_top_m, shape
 from services.detector.config import DetectorConfig
 from services.detector.cylinders import Cylinder, fit_cylinder
 from services.detector.forks import Arm, Fork, find_forks
+from services.detector.halves import both_halves
 from services.detector.model import Floats, Ground, Rejection, Trunk, Views
 from services.detector.stacks import Stack
-from services.detector.upright import Upright
+from services.detector.upright import Floats32, Upright
 from services.detector.voxels import Voxels
 
 BREAST_HEIGHT_M = 1.3
@@ -26,7 +27,8 @@ class Surroundings:
     """All that a candidate is judged against."""
 
     voxels: Voxels
-    above: Voxels
+    above_m: Floats32
+    """(L, 3) points above trunk height, upright frame."""
     views: Views | None
     frame: Upright
     ground: Ground
@@ -53,8 +55,8 @@ def judge(stacks: list[Stack], around: Surroundings) -> tuple[list[Trunk], list[
     kept: list[Candidate] = []
     rejections: list[Rejection] = []
     unsure: list[Arm] = []
-    for stack in stacks:
-        found = _examine(stack, kept, around)
+    for stack, cylinder in zip(stacks, _fits(stacks, around), strict=True):
+        found = _examine(stack, cylinder, kept, around)
         if isinstance(found, Rejection):
             rejections.append(found)
             if found.reason == _NO_CYLINDER and stack.layers >= _ARM_LAYERS:
@@ -68,9 +70,22 @@ def judge(stacks: list[Stack], around: Surroundings) -> tuple[list[Trunk], list[
     return trunks, rejections
 
 
-def _examine(stack: Stack, kept: list[Candidate], around: Surroundings) -> Candidate | Rejection:
+def _fits(stacks: list[Stack], around: Surroundings) -> list[Cylinder | None]:
+    """Return the joint fit of each candidate; every second one on the other core."""
+    fits: list[Cylinder | None] = [None] * len(stacks)
+
+    def work(half: int) -> None:
+        for k in range(half, len(stacks), 2):
+            fits[k] = fit_cylinder(around.voxels, stacks[k], around.config)
+
+    both_halves(work, 20_000 * (len(stacks) - 1))
+    return fits
+
+
+def _examine(
+    stack: Stack, cylinder: Cylinder | None, kept: list[Candidate], around: Surroundings
+) -> Candidate | Rejection:
     config = around.config
-    cylinder = fit_cylinder(around.voxels, stack, config)
     if cylinder is None:
         return _rejection(stack.at_m, stack.radius_m, stack.layers, _NO_CYLINDER, around.frame)
     base = base_point(cylinder, around.ground)
@@ -78,7 +93,7 @@ def _examine(stack: Stack, kept: list[Candidate], around: Surroundings) -> Candi
     top = high
     reason = shape_fault(cylinder, low, high, around.span_m, config) or _twin_fault(cylinder, kept)
     if not reason:
-        z_top = prolonged_top_m(cylinder, around.above, base[2] + config.look_high_m)
+        z_top = prolonged_top_m(cylinder, around.above_m, base[2] + config.look_high_m)
         top = z_top - base[2]
         reason = _post_fault(cylinder, top, z_top, around)
     if reason:
@@ -95,7 +110,7 @@ def _post_fault(cylinder: Cylinder, top_m: float, z_top: float, around: Surround
     if top_m >= around.config.post_top_m:
         return ""
     free = axis_at(cylinder, z_top + 0.35)
-    if not space_above_was_seen(free, around.views, around.frame, around.above, z_top):
+    if not space_above_was_seen(free, around.views, around.frame, around.above_m, z_top):
         return ""
     return f"ends {top_m:.1f} m above ground with free space seen above it: a post"
 

@@ -7,9 +7,8 @@ from numba import njit
 
 from services.detector.config import DetectorConfig
 from services.detector.cylinders import Cylinder
-from services.detector.model import Floats, Ground, Views
-from services.detector.upright import Upright
-from services.detector.voxels import Voxels
+from services.detector.model import Floats, Ground, Ints, Views
+from services.detector.upright import Floats32, Upright
 
 _BAND_M = 0.15
 _MAX_FILL = 0.4
@@ -51,8 +50,8 @@ def shape_fault(cylinder: Cylinder, low_m: float, high_m: float, span_m: float, 
 
 
 @njit(cache=True, nogil=True)
-def _top_band(
-    xyz: Floats,
+def _top_bands(
+    above: Floats32,
     x: float,
     y: float,
     z: float,
@@ -61,32 +60,40 @@ def _top_band(
     r: float,
     taper: float,
     z_from: float,
-    bands: Floats,
+    bands: Ints,
 ) -> None:
-    """Count points near the surface of the prolonged cylinder in bands of 15 cm above ``z_from``."""
-    for i in range(xyz.shape[0]):
-        k = int((xyz[i, 2] - z_from) / _BAND_M) if xyz[i, 2] >= z_from else -1
-        if k < 0 or k >= bands.shape[0]:
+    """Mark in each 15 cm band above ``z_from`` which eighths of the prolonged surface, in thirds of the band, show points.
+
+    Marks, not numbers of points: a dense cloud must not make a surface of one stray leaf.
+    """
+    for i in range(above.shape[0]):
+        dz = above[i, 2] - z
+        dx, dy = above[i, 0] - x - sx * dz, above[i, 1] - y - sy * dz
+        at = max(r + taper * dz, 0.01)
+        d2, reach = dx * dx + dy * dy, 0.06 + 0.3 * r
+        if d2 > (at + reach) ** 2 or (at > reach and d2 < (at - reach) ** 2) or above[i, 2] < z_from:
             continue
-        dz = xyz[i, 2] - z
-        d = np.sqrt((xyz[i, 0] - x - sx * dz) ** 2 + (xyz[i, 1] - y - sy * dz) ** 2)
-        if abs(d - max(r + taper * dz, 0.01)) < 0.06 + 0.3 * r:
-            bands[k] += 1.0
+        k = int((above[i, 2] - z_from) / _BAND_M)
+        if k >= bands.shape[0]:
+            continue
+        third = min(2, int(((above[i, 2] - z_from) / _BAND_M - k) * 3.0))
+        eighth = (4 if dx > 0.0 else 0) + (2 if dy > 0.0 else 0) + (1 if abs(dx) > abs(dy) else 0)
+        bands[k] |= 1 << (8 * third + eighth)
 
 
-def prolonged_top_m(cylinder: Cylinder, above: Voxels, z_limit_m: float) -> float:
+def prolonged_top_m(cylinder: Cylinder, above_m: Floats32, z_limit_m: float) -> float:
     """Return the z (upright frame) up to which the trunk goes on without a gap of more than 0.45 m."""
     c = cylinder
     z_from = c.z_high_m
     count = int(max(0.0, (z_limit_m - z_from) / _BAND_M))
-    if count == 0 or len(above.xyz_m) == 0:
+    if count == 0 or len(above_m) == 0:
         return z_from
-    bands = np.zeros(count)
+    bands = np.zeros(count, dtype=np.int64)
     sx, sy = c.axis[:2] / c.axis[2]
-    _top_band(above.xyz_m, c.at_m[0], c.at_m[1], c.at_m[2], sx, sy, c.radius_m, c.taper, z_from, bands)
+    _top_bands(above_m, c.at_m[0], c.at_m[1], c.at_m[2], sx, sy, c.radius_m, c.taper, z_from, bands)
     top, gap = z_from, 0
     for k in range(count):
-        if bands[k] >= 2:
+        if int(bands[k]).bit_count() >= 2:
             top, gap = z_from + (k + 1) * _BAND_M, 0
         else:
             gap += 1
@@ -95,7 +102,22 @@ def prolonged_top_m(cylinder: Cylinder, above: Voxels, z_limit_m: float) -> floa
     return top
 
 
-def space_above_was_seen(p_m: Floats, views: Views | None, frame: Upright, above: Voxels, z_top_m: float) -> bool:
+@njit(cache=True, nogil=True)
+def _places_above(above: Floats32, x: float, y: float, z_low: float, z_high: float) -> int:
+    """Count the 5 cm squares of the plan within 1.5 m that show points between two heights."""
+    squares = np.zeros((60, 60), dtype=np.bool_)
+    count = 0
+    for i in range(above.shape[0]):
+        dx, dy = above[i, 0] - x, above[i, 1] - y
+        if dx * dx + dy * dy >= 2.25 or not z_low < above[i, 2] < z_high:
+            continue
+        a, b = min(59, int((dx + 1.5) * 20.0)), min(59, int((dy + 1.5) * 20.0))
+        count += 0 if squares[a, b] else 1
+        squares[a, b] = True
+    return count
+
+
+def space_above_was_seen(p_m: Floats, views: Views | None, frame: Upright, above_m: Floats32, z_top_m: float) -> bool:
     """Tell whether the space at an upright point above a column's top was looked at.
 
     With posed views: some camera had it in its field of view and within reach. Without: the cloud shows other things
@@ -109,9 +131,6 @@ def space_above_was_seen(p_m: Floats, views: Views | None, frame: Upright, above
         seen = (z > 0.5) & (z < 0.9 * views.max_range_m)
         seen &= (np.abs(local[:, 0]) < 0.9 * tan_x * z) & (np.abs(local[:, 1]) < 0.95 * tan_y * z)
         return bool(seen.any())
-    if views is not None or len(above.xyz_m) == 0:
+    if views is not None or len(above_m) == 0:
         return False
-    d = above.xyz_m[:, :2] - p_m[:2]
-    near = (d**2).sum(axis=1) < 1.5**2
-    higher = (above.xyz_m[:, 2] > z_top_m + 0.4) & (above.xyz_m[:, 2] < z_top_m + 1.5)
-    return bool(np.count_nonzero(near & higher) >= 20)
+    return int(_places_above(above_m, float(p_m[0]), float(p_m[1]), z_top_m + 0.4, z_top_m + 1.5)) >= 20

@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.detector.arcs import fit_slices
+from services.detector.band import crop
 from services.detector.candidates import Surroundings, judge
 from services.detector.config import DetectorConfig
 from services.detector.ground import find_ground
 from services.detector.model import DetectionResult, Ground, Views
 from services.detector.stacks import stack_circles
 from services.detector.upright import upright_frame
-from services.detector.voxels import Voxels, clusters_per_layer, crop_to_voxels, plan_spacing_m
+from services.detector.voxels import Voxels, slice_clusters
 
 
 @dataclass(slots=True)
@@ -57,24 +58,22 @@ def detect_trees(
     frame = upright_frame(points_m, up)
     if frame.finite == 0:
         return _empty(points_m, up)
-    ground = find_ground(points_m, frame, config.ground_cell_m)
+    watch.lap("upright")
+    grounded = find_ground(frame, config.ground_cell_m)
+    ground = grounded.ground
     watch.lap("ground")
     crop_low = config.crop_low_m if ground.seen else -0.05
-    voxels = crop_to_voxels(points_m, views, frame, ground, crop_low, config.crop_high_m, config.voxel_m)
-    above = crop_to_voxels(points_m, None, frame, ground, config.crop_high_m, config.look_high_m, 0.03)
+    band = crop(frame, grounded, crop_low, config.crop_high_m, config.look_high_m)
     watch.lap("crop")
-    spacing = plan_spacing_m(voxels, frame.low, config.layer_m)
-    layer_m = float(np.clip(4.0 * spacing, config.layer_m, 2.5 * config.layer_m))
-    link_m = float(np.clip(2.5 * spacing, config.link_m, 0.08))
-    order, begin = clusters_per_layer(voxels, frame.low, layer_m, link_m)
+    slices = slice_clusters(frame, band, views, config.layer_m, config.link_m, config.voxel_m)
     watch.lap("clusters")
-    circles = fit_slices(voxels, order, begin, frame.low, spacing, layer_m, config)
+    circles = fit_slices(slices, frame.low, config)
     watch.lap("arcs")
-    span_m = _needed_span_m(voxels, ground, config)
-    min_layers = max(3.0, min(config.min_layers, 0.8 * span_m / layer_m))
+    span_m = _needed_span_m(slices.voxels, ground, config)
+    min_layers = max(3.0, min(config.min_layers, 0.8 * span_m / slices.layer_m))
     stacks = stack_circles(circles, 0.75 * min_layers, config)
     watch.lap("stacks")
-    trunks, rejections = judge(stacks, Surroundings(voxels, above, views, frame, ground, span_m, config))
+    trunks, rejections = judge(stacks, Surroundings(slices.voxels, band.above_m, views, frame, ground, span_m, config))
     watch.lap("cylinders")
     return DetectionResult(
         tuple(trunks), tuple(rejections), ground, up, frame.finite, len(points_m) - frame.finite, watch.stages

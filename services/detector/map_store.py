@@ -7,9 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.mapping import Submap
+from schemas.mapping import MapIndex, Submap
 from services.common.geometry import inverse
 from services.detector.model import Floats, Views
+
+
+_PATIENCE_S = (2.0, 30.0)
+"""Least and longest time between two questions for the whole map."""
 
 
 @dataclass(slots=True)
@@ -21,6 +25,8 @@ class _Held:
     view: NDArray[np.int32] = field(repr=False)
     origins_local_m: Floats = field(repr=False)
     tan_half: tuple[float, float] = (0.0, 0.0)
+    placed_by: int = 0
+    """Version of the graph that placed it."""
 
 
 class MapStore:
@@ -31,6 +37,9 @@ class MapStore:
         self.graph_version = 0
         self.changed_points = 0
         """Points that came, went or moved since ``settle``."""
+        self._epoch: int | None = None
+        """The run of the mapper whose versions these are; None until an index told."""
+        self._patience_s, self._not_before_ns = _PATIENCE_S[0], 0
         self._held: dict[int, _Held] = {}
 
     def __len__(self) -> int:
@@ -40,6 +49,7 @@ class MapStore:
         """Begin a new map."""
         self.map_id, self.graph_version, self._held = map_id, 0, {}
         self.changed_points = 0
+        self._patience_s, self._not_before_ns = _PATIENCE_S[0], 0
 
     def settle(self) -> None:
         """Note that all changes have been looked at."""
@@ -55,7 +65,7 @@ class MapStore:
             return True
         if len(submap.points_m) == 0 and (held is None or held.version != submap.version):
             return False
-        if held is not None and held.version > submap.version:
+        if held is not None and (submap.version, submap.graph_version) < (held.version, held.placed_by):
             return True  # an answer to a query that a newer delta has overtaken
         T = submap.T_map_submap
         if held is None or held.version != submap.version:
@@ -66,8 +76,40 @@ class MapStore:
             self._held[submap.submap_id] = held
         else:
             held.T_map_submap, held.map_m = T, _placed(held.local_m, T)
+        held.placed_by = submap.graph_version
         self.changed_points += len(held.local_m)
         return True
+
+    def lacks(self, index: MapIndex, now_ns: int) -> bool:
+        """Return whether the mapper holds more or newer than this store, so that the whole is to be asked for.
+
+        What the mapper does not hold any more goes. Asking is answered with yes at most every 2 s, and ever more seldom
+        (to 30 s) while it does not help. An index of another map is nothing to go by: its submaps come first.
+        """
+        if index.map_id != self.map_id:
+            return False
+        if index.epoch != self._epoch:
+            if self._epoch is not None:
+                self._drop(set(self._held))  # versions of another run of the mapper
+            self._epoch = index.epoch
+        self._drop(set(self._held) - set(index.submap_ids))
+        entries = zip(index.submap_ids, index.versions, index.placed_by, strict=True)
+        if all(self._is_as_new(*entry) for entry in entries):
+            self._patience_s = _PATIENCE_S[0]
+            return False
+        if now_ns < self._not_before_ns:
+            return False
+        self._not_before_ns = now_ns + round(self._patience_s * 1e9)
+        self._patience_s = min(2.0 * self._patience_s, _PATIENCE_S[1])
+        return True
+
+    def _is_as_new(self, submap_id: int, version: int, placed_by: int) -> bool:
+        held = self._held.get(submap_id)
+        return held is not None and held.version >= version and held.placed_by >= placed_by
+
+    def _drop(self, submap_ids: set[int]) -> None:
+        for submap_id in submap_ids:
+            self.changed_points += len(self._held.pop(submap_id).local_m)
 
     def assemble(self) -> tuple[NDArray[np.float32], Views]:
         """Return all points in the map frame (N, 3) and their views."""

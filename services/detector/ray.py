@@ -1,4 +1,4 @@
-"""Distance of a point from a circle along the viewing ray, its noise, and a small linear solver.
+"""Distance of a point from a circle along the viewing ray, and its noise.
 
 Depth noise lies along the ray. A radial residual turns it into a bias: points before and behind the surface both
 pull the circle thinner on a one-sided arc. The residual along the ray is the noise itself. With the unit ray ``u``
@@ -60,28 +60,3 @@ def point_sigma(s_share: float, range_m: float, ray: bool, k_range: float, surfa
     cosine = np.sqrt(max(1.0 - s_share * s_share, 0.10))
     depth = k_range * range_m * range_m
     return np.sqrt(depth * depth + (surface / cosine) ** 2)
-
-
-@njit(cache=True, nogil=True)
-def solve(A: Floats, y: Floats, x: Floats) -> None:
-    """Solve a small symmetric positive definite system by Cholesky; ``A`` is overwritten."""
-    n = y.shape[0]
-    for i in range(n):
-        for j in range(i + 1):
-            v = A[i, j]
-            for k in range(j):
-                v -= A[i, k] * A[j, k]
-            if i == j:
-                A[i, i] = np.sqrt(max(v, 1e-18))
-            else:
-                A[i, j] = v / A[j, j]
-    for i in range(n):
-        v = y[i]
-        for k in range(i):
-            v -= A[i, k] * x[k]
-        x[i] = v / A[i, i]
-    for i in range(n - 1, -1, -1):
-        v = x[i]
-        for k in range(i + 1, n):
-            v -= A[k, i] * x[k]
-        x[i] = v / A[i, i]

@@ -7,7 +7,7 @@ from numba import njit
 
 from services.detector.model import Floats, Ints
 
-_GOOD = 0.7
+GOOD = 0.7
 """A circle with this share of all points (truncated quadratic count) needs no rival."""
 
 
@@ -33,23 +33,39 @@ def _circumcircle(P: Floats, i: int, j: int, k: int, out: Floats) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _score(P: Floats, U: Floats, S: Floats, left: Ints, n: int, c: Floats) -> float:
-    """Return a truncated quadratic count of the points on the visible side, less half of those inside the circle."""
+def _part_score(P: Floats, U: Floats, S: Floats, left: Ints, first: int, n: int, step: int, c: Floats) -> float:
+    """Sum the score over every ``step``-th point from ``first`` on."""
     score = 0.0
-    step = max(1, n // 100)
-    for q in range(0, n, step):
+    wide = 0.08 * min(c[2], 0.15)
+    for q in range(first, n, step):
         i = left[q]
         dx, dy = P[i, 0] - c[0], P[i, 1] - c[1]
-        d = np.sqrt(dx * dx + dy * dy)
-        tol = S[i] + 0.08 * min(c[2], 0.15)
-        e = (d - c[2]) / tol
-        if abs(e) < 1.0:
-            facing = dx * U[i, 0] + dy * U[i, 1]
-            if facing <= 0.25 * c[2] + tol:
+        tol = S[i] + wide
+        d2 = dx * dx + dy * dy
+        if d2 > (c[2] + tol) ** 2:
+            continue
+        e = (np.sqrt(d2) - c[2]) / tol
+        if e > -1.0:
+            if dx * U[i, 0] + dy * U[i, 1] <= 0.25 * c[2] + tol:
                 score += 1.0 - e * e
-        elif e < 0.0:
+        else:
             score -= 0.5
-    return score * step
+    return score
+
+
+@njit(cache=True, nogil=True)
+def circle_score(P: Floats, U: Floats, S: Floats, left: Ints, n: int, c: Floats, top: float) -> float:
+    """Return a truncated quadratic count of the points on the visible side, less half of those inside the circle.
+
+    About 100 points are looked at; only a quarter of them where that quarter shows no hope of passing ``top``.
+    """
+    step = max(1, n // 100)
+    part = _part_score(P, U, S, left, 0, n, 4 * step, c)
+    if 4.0 * part * step < 0.5 * top:
+        return 4.0 * part * step
+    for first in range(1, 4):
+        part += _part_score(P, U, S, left, first * step, n, 4 * step, c)
+    return part * step
 
 
 @njit(cache=True, nogil=True)
@@ -83,10 +99,10 @@ def best_seed(
                 break
         if k < 0 or not _circumcircle(P, i, j, k, c) or not r_min <= c[2] <= r_max:
             continue
-        score = _score(P, U, S, left, n, c)
+        score = circle_score(P, U, S, left, n, c, top)
         if score > top:
             top = score
             best[0], best[1], best[2] = c[0], c[1], c[2]
-            if trial > 8 and top > _GOOD * n:
+            if trial > 8 and top > GOOD * n:
                 break
     return top

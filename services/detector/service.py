@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from schemas.codec import Wire
-from schemas.mapping import Submap
-from schemas.topics import MAP_CLOUD, SLAM_POSE, TREES_LIST, TREES_TARGET
+from schemas.mapping import MapIndex, Submap
+from schemas.topics import MAP_CLOUD, MAP_INDEX, SLAM_POSE, TREES_LIST, TREES_TARGET
 from schemas.trees import Target, Tree, TreeList
 from services.common.context import Context
 from services.detector.config import DetectorServiceConfig
@@ -37,6 +37,7 @@ class DetectorService:
         self.result: DetectionResult | None = None
         """Of the last detection, for explanations."""
         context.on(MAP_CLOUD, self.on_submap)
+        context.on(MAP_INDEX, self.on_index)
         context.on(SLAM_POSE, self._fusion.on_pose)
         context.on(TREES_TARGET, self.on_target)
         context.every(1.0 / config.max_rate_hz, self.on_timer)
@@ -47,11 +48,15 @@ class DetectorService:
         if submap.map_id != self._store.map_id:
             if submap.removed:
                 return
-            self._store.clear(submap.map_id)
-            self._identities.clear()
-            self._fusion.clear(submap.map_id)
-            self._anchored = {}
+            self._begin(submap.map_id)
         if not self._store.take(submap):
+            self._incomplete = True
+
+    def on_index(self, index: MapIndex) -> None:
+        """Notice what of the map was missed; a late joiner begins with it."""
+        if not self._store.map_id:
+            self._begin(index.map_id)
+        if self._store.lacks(index, self._context.clock.now_ns()):
             self._incomplete = True
 
     def on_target(self, target: Target) -> None:
@@ -81,6 +86,13 @@ class DetectorService:
     def state(self) -> list[Wire]:
         """Return the latest list, if there is one."""
         return [self._published] if self._published is not None else []
+
+    def _begin(self, map_id: str) -> None:
+        """Forget the old map."""
+        self._store.clear(map_id)
+        self._identities.clear()
+        self._fusion.clear(map_id)
+        self._anchored = {}
 
     def _fetch_whole_map(self) -> None:
         self._incomplete = False

@@ -5,10 +5,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from services.common.kernels import solve_positive
 from services.detector.arcs import fit_slices
+from services.detector.band import Band
 from services.detector.config import DetectorConfig
-from services.detector.ray import RIM, point_sigma, residual, solve
-from services.detector.voxels import Voxels, clusters_per_layer
+from services.detector.model import Views
+from services.detector.ray import RIM, point_sigma, residual
+from services.detector.upright import upright_frame
+from services.detector.voxels import slice_clusters
 
 angles = st.floats(-3.1, 3.1)
 
@@ -63,7 +67,7 @@ def test_solve_small_system() -> None:
     A = M @ M.T + np.eye(6)
     want = rng.normal(size=6)
     y, x = A @ want, np.empty(6)
-    solve(A.copy(), y, x)
+    solve_positive(A.copy(), y, x)
     assert x == pytest.approx(want)
 
 
@@ -71,7 +75,7 @@ def _one_slice(noise_m: float, seed: int, rays: bool) -> float:
     """Return the mean radius error over layers of a one-sided arc of 10 cm seen from 4 m."""
     rng = np.random.default_rng(seed)
     n, layers = 120, 15
-    xyz, ray = [], []
+    xyz = []
     for layer in range(layers):
         a = rng.uniform(np.pi - 1.1, np.pi + 1.1, n)
         surface = np.stack([4.0 + 0.1 * np.cos(a), 0.1 * np.sin(a)], axis=1)
@@ -79,13 +83,13 @@ def _one_slice(noise_m: float, seed: int, rays: bool) -> float:
         p = surface + unit * rng.normal(0.0, noise_m, (n, 1))
         z = np.full((n, 1), 0.05 + 0.1 * layer)
         xyz.append(np.hstack([p, z]))
-        ray.append(np.hstack([p, np.zeros((n, 1))]) if rays else np.zeros((n, 3)))
     points = np.concatenate(xyz)
-    voxels = Voxels(points, points[:, 2], np.concatenate(ray), np.ones(len(points)), rays)
-    low = np.array([3.0, -1.0, 0.0])
-    order, begin = clusters_per_layer(voxels, low, 0.1, 0.05)
+    frame = upright_frame(points, (0.0, 0.0, 1.0))
+    index, none = np.arange(len(points), dtype=np.int32), np.zeros((0, 3), dtype=np.float32)
+    views = Views.of_points(points * [0.0, 0.0, 1.0]) if rays else None
+    slices = slice_clusters(frame, Band(index, points[:, 2].astype(np.float32), none), views, 0.1, 0.05, 0.001)
     config = DetectorConfig(range_noise_per_m=noise_m / 16.0, surface_noise_m=0.004)
-    circles = fit_slices(voxels, order, begin, low, 0.01, 0.1, config)
+    circles = fit_slices(slices, frame.low, config)
     assert len(circles.layer) >= layers // 2
     return float(np.median(circles.radius_m)) - 0.1
 

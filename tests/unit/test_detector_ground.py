@@ -12,7 +12,7 @@ UP = (0.0, 0.0, 1.0)
 
 def _height(cloud: Floats, x: float, y: float) -> tuple[float, bool]:
     frame = upright_frame(cloud, UP)
-    g = find_ground(cloud, frame, 0.5)
+    g = find_ground(frame, 0.5).ground
     p = frame.from_input(np.array([x, y, 0.0]))
     return g.height_m(float(p[0]), float(p[1])) + float(frame.shift[2]), g.seen
 
