@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.trees import Tree
+from schemas.trees import Target, Tree
 from services.evaluate.exports import Stamped, tree_rows
+from services.evaluate.report_pictures import cross_section_svg, filter_plots_svg
 from services.evaluate.top_view import top_view_svg
 
+_MAX_PICTURES = 60
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 60rem; padding: 0 1rem; color: #1d2a20; }
 h1, h2 { font-weight: 600; } table { border-collapse: collapse; margin: 0.5rem 0 1.5rem; }
@@ -20,6 +22,7 @@ th, td { padding: 0.2rem 0.7rem; text-align: right; border-bottom: 1px solid #d5
 th:first-child, td:first-child { text-align: left; }
 svg { width: 100%; height: auto; background: #f6f8f5; border: 1px solid #d5ddd6; }
 .warn { color: #9a3412; }
+.trunks { display: flex; flex-wrap: wrap; gap: 0.75rem; } .trunks svg { width: 190px; }
 .cards { display: flex; flex-wrap: wrap; gap: 0.75rem; }
 .cards div { flex: 1 1 7.5rem; border: 1px solid #d5ddd6; border-radius: 6px; padding: 0.5rem 0.8rem; }
 .cards small { display: block; color: #5c6b60; } .cards b { font-size: 1.4rem; font-weight: 600; }
@@ -32,14 +35,15 @@ def report_bytes(
     trees: Sequence[Tree],
     trajectory: Sequence[Stamped],
     points_m: NDArray[np.float32],
+    targets: Sequence[Target] = (),
 ) -> bytes:
-    """Return the page for a run's metrics ``values``, its trees, final trajectory and map points (N, 3)."""
+    """Return the page for a run's metrics ``values``, its trees, final trajectory, map points (N, 3) and targets."""
     bad = [f'<p class="warn">left out: {html.escape(reason)}</p>' for reason in values["bad_frame_reasons"][:20]]
     body = [
         "<!doctype html>", '<html lang="en"><head><meta charset="utf-8">', f"<title>{html.escape(title)}</title>",
         f"<style>{_STYLE}</style></head><body>", f"<h1>{html.escape(title)}</h1>", _summary(values), *bad,
         "<h2>Trees</h2>", _tree_table(trees), "<h2>From above</h2>", top_view_svg(trees, trajectory, points_m),
-        "<h2>Time</h2>", _timings(values["ms"]), "</body></html>",
+        *_trunks(trees, points_m), *_filters(targets), "<h2>Time</h2>", _timings(values["ms"]), "</body></html>",
     ]  # fmt: skip
     return ("\n".join(body) + "\n").encode()
 
@@ -93,6 +97,21 @@ def _tree_table(trees: Sequence[Tree]) -> str:
             "yes" if row["suitable"] else "no",
         ))  # fmt: skip
     return _table(head, rows)
+
+
+def _trunks(trees: Sequence[Tree], points_m: NDArray[np.float32]) -> list[str]:
+    if not trees:
+        return []
+    shown = sorted(trees, key=lambda tree: (not tree.suitable, tree.id))[:_MAX_PICTURES]
+    left_out = f" The first {_MAX_PICTURES} of {len(trees)} are shown." if len(trees) > _MAX_PICTURES else ""
+    words = "Points of the map within 10 cm of the height where the diameter was measured, from above, and the fit."
+    pictures = [cross_section_svg(tree, points_m) for tree in shown]
+    return ["<h2>Trunks</h2>", f"<p>{words}{left_out}</p>", '<section class="trunks">', *pictures, "</section>"]
+
+
+def _filters(targets: Sequence[Target]) -> list[str]:
+    plots = filter_plots_svg(targets)
+    return ["<h2>Target</h2>", plots] if plots else []
 
 
 def _timings(stages: Mapping[str, Mapping[str, float]]) -> str:

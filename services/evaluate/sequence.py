@@ -74,7 +74,9 @@ def result_files(title: str, result: OfflineResult, values: dict[str, Any]) -> d
         "trees.geojson": exports.trees_geojson(result.trees, "map"),
         "targets.jsonl": exports.targets_jsonl(result.targets),
         "metrics.json": metrics_bytes(values),
-        "report.html": report_bytes(f"treedock: {title}", values, result.trees, result.trajectory, result.points_m),
+        "report.html": report_bytes(
+            f"treedock: {title}", values, result.trees, result.trajectory, result.points_m, result.targets
+        ),
     }
 
 
