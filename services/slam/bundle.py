@@ -5,6 +5,7 @@ Triggs, McLauchlan, Hartley and Fitzgibbon, "Bundle adjustment: a modern synthes
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -261,12 +262,19 @@ def adjust(problem: Problem, camera: F64, free: int, iterations: int, robust: bo
     return cost
 
 
-def adjust_large(problem: Problem, camera: F64, free: int, iterations: int, robust: bool) -> float:
-    """Do the same as ``adjust`` with the cameras' system solved by LAPACK: for a map of many keyframes."""
+def adjust_large(
+    problem: Problem, camera: F64, free: int, iterations: int, robust: bool, hurried: Callable[[], bool] | None = None
+) -> float:
+    """Do the same as ``adjust`` with the cameras' system solved by LAPACK: for a map of many keyframes.
+
+    Between two iterations it stops when ``hurried()``.
+    """
     work = workspace(problem, free)
     cost = total_cost(problem, camera, robust)
     damping = 1e-5
     for _ in range(iterations):
+        if hurried is not None and hurried():
+            break
         reduce_system(problem, camera, free, robust, damping, work)
         lower = np.tril(work.S)
         try:

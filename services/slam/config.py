@@ -37,5 +37,7 @@ class SlamConfig(BaseModel):
     """A keyframe at once when fewer close points are tracked and more are not."""
     window_keyframes: int = Field(default=12, ge=2)
     """Keyframes that a local bundle adjustment moves."""
+    full_keyframes: int = Field(default=150, ge=10)
+    """A map of more is adjusted in parts of so many keyframes."""
     loop_closing: bool = True
     relocalise: bool = True

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from services.common.geometry import inverse, pose
 from services.slam.atlas import Atlas, neighbours
 from services.slam.binary import match_all
 from services.slam.camera import CameraModel
@@ -50,6 +51,8 @@ class Loops:
         self.tracking = tracking
         self.places = places
         self.config = config
+        self.closed = 0
+        """Counts corrections by loops, each loop's graph and its adjustment."""
 
     @property
     def atlas(self) -> Atlas:
@@ -63,10 +66,12 @@ class Loops:
 
     def consider(self, k: int) -> Correction | None:
         """Look whether the new keyframe ``k`` closes a loop; if so correct the map."""
-        kf = self.atlas.keyframes
-        bag = self.places.add(int(kf.serial[k]), kf.desc[k, : kf.n[k]])
-        self.places.keep_only({int(s) for s in kf.serial[kf.n > 0]})
-        for candidate in self._candidates(k, bag):
+        with self.mapping.step():
+            kf = self.atlas.keyframes
+            bag = self.places.add(int(kf.serial[k]), kf.desc[k, : kf.n[k]])
+            self.places.keep_only({int(s) for s in kf.serial[kf.n > 0]})
+            candidates = self._candidates(k, bag)
+        for candidate in candidates:
             found = self._verify(k, candidate)
             if found is not None:
                 return self.close(k, candidate, found)
@@ -115,62 +120,95 @@ class Loops:
     def place(self, features: Features, candidate: int) -> Tracked | None:
         """Locate features against one keyframe and its neighbours, without any prior; None when they do not fit."""
         atlas = self.atlas
-        kf = atlas.keyframes
-        has = np.flatnonzero(kf.point[candidate, : kf.n[candidate]] >= 0)
+        with self.mapping.step():
+            kf = atlas.keyframes
+            has = np.flatnonzero(kf.point[candidate, : kf.n[candidate]] >= 0)
+            known, desc = kf.point[candidate, has].copy(), kf.desc[candidate, has].copy()
+            angle, place = kf.angle[candidate, has].astype(float), atlas.points.pos[known].copy()
         if len(has) < 15:
             return None
-        known = kf.point[candidate, has].copy()
-        match = match_all(kf.desc[candidate, has], features.desc, MATCH_BLIND, 0.85)
-        keep_common_turn(match, kf.angle[candidate, has].astype(float), features.angle)
-        rough = self.tracking.locate_by_ransac(features, atlas.points.pos[known], match, known)
-        if rough is None or rough.inliers < 12:
-            return None
-        group = np.concatenate([[candidate], neighbours(atlas, candidate, _COVISIBLE, 10)]).astype(np.int32)
-        located = self.tracking.join_keyframes(rough, group, _WINDOW_PX)
-        return None if located is None else self.tracking.join_keyframes(located, group, 0.5 * _WINDOW_PX)
+        match = match_all(desc, features.desc, MATCH_BLIND, 0.85)
+        keep_common_turn(match, angle, features.angle)
+        with self.mapping.step():
+            rough = self.tracking.locate_by_ransac(features, place, match, known)
+            if rough is None or rough.inliers < 12:
+                return None
+            group = np.concatenate([[candidate], neighbours(atlas, candidate, _COVISIBLE, 10)]).astype(np.int32)
+            located = self.tracking.join_keyframes(rough, group, _WINDOW_PX)
+            return None if located is None else self.tracking.join_keyframes(located, group, 0.5 * _WINDOW_PX)
 
-    def close(self, k: int, candidate: int, found: Tracked) -> Correction:
-        """Correct the poses by a pose graph, join the points of both sides, then adjust everything."""
-        atlas = self.atlas
-        kf = atlas.keyframes
-        jump_m, jump_rad = moved(kf.R[k], kf.t[k], found.R, found.t)
-        group = np.concatenate([[candidate], neighbours(atlas, candidate, _COVISIBLE, 10)]).astype(np.int32)
-        old_points = points_of(atlas.points, kf, group)
-        own = np.concatenate([[k], neighbours(atlas, k, _COVISIBLE, 10)]).astype(np.int32)
-        own = own[~np.isin(own, group)]
-        self._correct_poses(k, candidate, found)
-        join_loop(atlas.points, kf, k, found.point, atlas.scales)
+    def close(self, k: int, candidate: int, found: Tracked) -> Correction | None:
+        """Correct the poses by a pose graph, join the points of both sides, then adjust everything.
+
+        None when the map was turned meanwhile: the next keyframe will see the loop again.
+        """
+        atlas, mapping = self.atlas, self.mapping
+        with mapping.step():
+            kf = atlas.keyframes
+            jump_m, jump_rad = moved(kf.R[k], kf.t[k], found.R, found.t)
+            group = np.concatenate([[candidate], neighbours(atlas, candidate, _COVISIBLE, 10)]).astype(np.int32)
+            old_points = points_of(atlas.points, kf, group)
+            own = np.concatenate([[k], neighbours(atlas, k, _COVISIBLE, 10)]).astype(np.int32)
+            own = own[~np.isin(own, group)]
+        if not self._correct_poses(k, candidate, found):
+            return None
+        with mapping.step():
+            join_loop(atlas.points, atlas.keyframes, k, found.point, atlas.scales)
         for s in own:
-            self.mapping.fuse_into(int(s), old_points)
-        self.mapping.adjust_all()
+            mapping.fuse_into(int(s), old_points)
+        mapping.adjust_all(k)
+        self.closed += 1
         return Correction(jump_m, jump_rad)
 
-    def _correct_poses(self, k: int, candidate: int, found: Tracked) -> None:
+    def _correct_poses(self, k: int, candidate: int, found: Tracked) -> bool:
         """Spread the loop's error over all keyframes; each point moves with the keyframe that saw it first."""
-        atlas = self.atlas
-        kf = atlas.keyframes
-        slots = atlas.slots
-        index = np.full(len(kf.n), -1, np.int32)
-        index[slots] = np.arange(len(slots))
-        R, t = kf.R[slots].copy(), kf.t[slots].copy()
+        atlas, mapping = self.atlas, self.mapping
+        with mapping.step():
+            kf, turns, slots = atlas.keyframes, mapping.turns, atlas.slots
+            index = np.full(len(kf.n), -1, np.int32)
+            index[slots] = np.arange(len(slots))
+            R, t = kf.R[slots].copy(), kf.t[slots].copy()
+            free = kf.serial[slots] != 0
         edges = self._edges(slots, index, R, t, (k, candidate, found))
-        free = kf.serial[slots] != 0
         if free.all():
             free[0] = False
         optimise(R, t, edges, free)
-        move_points(atlas.points, kf, index, R, t)
-        kf.R[slots], kf.t[slots] = R, t
+        with mapping.step():
+            if turns != mapping.turns:
+                return False
+            slots, R, t = self._with_newer(slots, R, t)
+            kf = atlas.keyframes
+            index = np.full(len(kf.n), -1, np.int32)
+            index[slots] = np.arange(len(slots))
+            move_points(atlas.points, kf, index, R, t)
+            kf.R[slots], kf.t[slots] = R, t
+            mapping.revision += 1
+            self.closed += 1
+        return True
+
+    def _with_newer(self, slots: I32, R: F64, t: F64) -> tuple[I32, F64, F64]:
+        """Add the keyframes made while the graph was optimised: each moves with its best neighbour among ``slots``."""
+        kf = self.atlas.keyframes
+        for s in self.atlas.slots[~np.isin(self.atlas.slots, slots)]:
+            near = [int(n) for n in neighbours(self.atlas, int(s), 1, 30) if n in slots]
+            n = int(np.flatnonzero(slots == (near[0] if near else slots[-1]))[0])
+            moves = pose(kf.R[s], kf.t[s]) @ inverse(pose(kf.R[slots[n]], kf.t[slots[n]])) @ pose(R[n], t[n])
+            slots = np.append(slots, s)
+            R, t = np.concatenate([R, moves[None, :3, :3]]), np.concatenate([t, moves[None, :3, 3]])
+        return slots, R, t
 
     def _edges(self, slots: I32, index: I32, R: F64, t: F64, loop: tuple[int, int, Tracked]) -> Edges:
         """Return the graph's edges: the best covisible pairs as they stand, and the loop."""
         atlas = self.atlas
         pairs: dict[tuple[int, int], float] = {}
         for a, s in enumerate(slots):
-            counts = shared_counts(atlas.points, atlas.keyframes.point[s], len(index))
-            near = neighbours(atlas, int(s), _COVISIBLE, 6)
+            with self.mapping.step():
+                counts = shared_counts(atlas.points, atlas.keyframes.point[s], len(atlas.keyframes.n))
+                near = neighbours(atlas, int(s), _COVISIBLE, 6)
             for other in near:
-                b = int(index[other])
-                pairs[min(a, b), max(a, b)] = min(float(counts[other]) / 100.0, 2.0)
+                b = int(index[other]) if other < len(index) else -1
+                if b >= 0:  # not one of the newest
+                    pairs[min(a, b), max(a, b)] = min(float(counts[other]) / 100.0, 2.0)
             if a > 0:
                 pairs.setdefault((a - 1, a), 0.1)
         i = np.array([a for a, _ in pairs], np.int32)

@@ -47,3 +47,19 @@ class TrackResult:
     graph_version: int
     inliers: int
     up_sigma_rad: float
+
+
+def map_covariance(R: F64, information: F64 | None) -> F64:
+    """Return the covariance (6, 6) of T_map_camera for a left perturbation in the map frame.
+
+    ``R`` is camera from map, ``information`` (6, 6) of the pose, left perturbation of camera from map.
+
+    With T_camera_map -> exp(delta) T_camera_map, the camera's centre moves by -R^T v and its rotation by
+    exp(-R^T w): both blocks turn with R^T.
+    """
+    assert information is not None
+    covariance = np.linalg.inv(information + 1e-6 * np.eye(6))
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = R.T
+    out = turn @ covariance @ turn.T
+    return 0.5 * (out + out.T)

@@ -6,7 +6,8 @@ sensor's range, temporary points of the last frame, keyframes at once when close
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import time
+from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +24,10 @@ from services.slam.links import shared_counts
 from services.slam.loops import Loops
 from services.slam.mapping import Mapping
 from services.slam.places import Places
-from services.slam.results import GraphUpdate, NewKeyframe, TrackResult
-from services.slam.tracking import Tracked, Tracking
+from services.slam.results import GraphUpdate, NewKeyframe, TrackResult, map_covariance
+from services.slam.tracking import Tracked, Tracking, moved
+from services.slam.trail import Trail
+from services.slam.worker import Crew, Inline
 
 F64 = NDArray[np.float64]
 
@@ -33,21 +36,21 @@ _MIN_START_POINTS = 100
 _JUMP_M = 0.01
 _JUMP_RAD = 0.005
 """A loop that moves the camera by more is told as a jump."""
-
-
-@dataclass(slots=True)
-class _Log:
-    """Every tracked frame relative to its keyframe."""
-
-    stamp_ns: list[int] = field(default_factory=list)
-    keyframe: list[int] = field(default_factory=list)
-    T_keyframe_camera: list[F64] = field(default_factory=list)
+_BACKLOG = 2
+"""With so many keyframes waiting for mapping a frame that is only less well seen makes no other."""
 
 
 class Slam:
-    """Tracks one camera and keeps one map; deterministic, knows no clock and no bus."""
+    """Tracks one camera and keeps one map; knows no clock and no bus; deterministic with an ``Inline`` crew.
 
-    def __init__(self, intrinsics: Intrinsics, config: SlamConfig, map_id: str = "map-1") -> None:
+    ``crew`` does the mapping; ``keep_trail`` remembers the way: not for a service that runs without end.
+    """
+
+    def __init__(
+        self, intrinsics: Intrinsics, config: SlamConfig, map_id: str = "map-1", crew: Crew | None = None,
+        keep_trail: bool = True,
+    ) -> None:  # fmt: skip
+        self.crew: Crew = Inline() if crew is None else crew
         self.intrinsics = intrinsics
         self.config = config
         self.map_id = map_id
@@ -56,7 +59,7 @@ class Slam:
         self._extractor = Extractor(intrinsics, config)
         cells = camera.cols * int(np.ceil(intrinsics.height / 20.0))
         self.atlas = Atlas(config.features, cells, config.scale, config.levels)
-        self.mapping = Mapping(self.atlas, camera, config)
+        self.mapping = Mapping(self.atlas, camera, config, self.crew)
         self.tracking = Tracking(self.atlas, camera, config)
         self.loops = Loops(self.mapping, self.tracking, Places(vocabulary.load()), config)
         self.reset_counter = 0
@@ -71,7 +74,13 @@ class Slam:
         """T_keyframe_camera of the last tracked frame."""
         self._peak = 0
         """Most inliers of a frame since the last keyframe."""
-        self._log = _Log()
+        self._trail = Trail() if keep_trail else None
+        self._revision = 0
+        """Of the mapping's corrections, the last one taken over; and of its loops."""
+        self._closed = 0
+        self._why: GraphReason = "local_ba"
+        self.settled_ms: deque[float] = deque(maxlen=1000)
+        """How long mapping took over each keyframe."""
 
     def track(
         self,
@@ -88,15 +97,17 @@ class Slam:
         """
         accel_camera, attitude_up_camera = gravity.direction(accel_camera), gravity.direction(attitude_up_camera)
         features = self._extractor.extract(grey, depth_m)
-        if self.graph_version == 0:
-            return self._initialise(stamp_ns, features, accel_camera, attitude_up_camera)
-        frame = self._locate(features)
-        if frame is None and self.config.relocalise:
-            frame = self._relocalise(features)
-        if frame is None:
-            return self._lost(stamp_ns)
-        levelled = self._level_map(stamp_ns, frame, accel_camera, attitude_up_camera)
-        return self._accept(stamp_ns, frame, levelled=levelled)
+        with self.crew.frame():
+            if self.graph_version == 0:
+                return self._initialise(stamp_ns, features, accel_camera, attitude_up_camera)
+            graph = self._catch_up()
+            frame = self._locate(features)
+            if frame is None and self.config.relocalise:
+                frame = self._relocalise(features)
+            if frame is None:
+                return self._lost(stamp_ns, graph)
+            levelled = self._level_map(stamp_ns, frame, accel_camera, attitude_up_camera)
+            return self._accept(stamp_ns, frame, graph, levelled=levelled)
 
     def _initialise(self, stamp_ns: int, features: Features, accel: F64 | None, attitude: F64 | None) -> TrackResult:
         if np.count_nonzero(features.depth > 0.0) < _MIN_START_POINTS:
@@ -109,7 +120,32 @@ class Slam:
             features, np.ascontiguousarray(T_camera_map[:3, :3]), T_camera_map[:3, 3].copy(),
             np.full(len(features), -1, np.int32), len(features), np.eye(6) * 1e8,
         )  # fmt: skip
-        return self._accept(stamp_ns, frame)
+        return self._accept(stamp_ns, frame, None)
+
+    def _catch_up(self) -> GraphUpdate | None:
+        """Take over what mapping has corrected since: the last frame moves with its keyframe. Return the new graph."""
+        if self.mapping.revision == self._revision:
+            return None
+        last = self._last
+        if last is not None:
+            before = last.R, last.t
+            T = inverse(self.mapping.keyframe_pose(self._reference) @ self._anchor)
+            last.R, last.t = np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy()
+            self._tell_jump(*moved(*before, last.R, last.t))
+        return self._corrected()
+
+    def _tell_jump(self, jump_m: float, jump_rad: float) -> None:
+        """Count a jump when a loop moved the camera."""
+        if self.loops.closed != self._closed and (jump_m > _JUMP_M or jump_rad > _JUMP_RAD):
+            self._level.restart()
+            self._count_reset()
+
+    def _corrected(self) -> GraphUpdate:
+        """Return the graph after corrections."""
+        reason: GraphReason = "loop" if self.loops.closed != self._closed else self._why
+        self._revision, self._closed, self._why = self.mapping.revision, self.loops.closed, "local_ba"
+        self.graph_version += 1
+        return self._graph(reason)
 
     def _locate(self, features: Features) -> Tracked | None:
         """Return the frame located in the map, or None."""
@@ -158,40 +194,49 @@ class Slam:
     def _count_reset(self) -> None:
         self.reset_counter = (self.reset_counter + 1) % 256
 
-    def _accept(self, stamp_ns: int, frame: Tracked, *, levelled: bool = False) -> TrackResult:
+    def _accept(
+        self, stamp_ns: int, frame: Tracked, graph: GraphUpdate | None, *, levelled: bool = False
+    ) -> TrackResult:
         """Remember a frame that has its pose, and make a keyframe of it when the map needs one."""
         if self._last is not None:
             self._step = pose(frame.R, frame.t) @ inverse(pose(self._last.R, self._last.t))
         new: list[NewKeyframe] = []
-        graph = None
         if self._needs_keyframe(frame):
-            new, graph = self._make_keyframe(frame)
+            new, graph = self._make_keyframe(frame, graph)
         elif levelled:
             self.graph_version += 1
             graph = self._graph("full_ba")
         self._set_anchor(frame)
         self._last = frame
-        self._log.stamp_ns.append(stamp_ns)
-        self._log.keyframe.append(self._reference)
-        self._log.T_keyframe_camera.append(self._anchor)
+        if self._trail is not None:
+            self._trail.add(stamp_ns, self._reference, self._anchor)
         return self._result(stamp_ns, "tracking", frame, new, graph)
 
-    def _make_keyframe(self, frame: Tracked) -> tuple[list[NewKeyframe], GraphUpdate]:
-        """Put the frame into the map as a keyframe; the frame takes over what mapping makes of it."""
+    def _make_keyframe(self, frame: Tracked, graph: GraphUpdate | None) -> tuple[list[NewKeyframe], GraphUpdate]:
+        """Put the frame into the map as a keyframe; the frame takes over what mapping has made of it."""
         k = self.mapping.insert(frame.features, frame.R, frame.t, frame.point)
-        reason: GraphReason = "local_ba" if self.graph_version else "keyframe"
-        correction = self.loops.consider(k) if self.config.loop_closing else None
-        if correction is not None:
-            reason = "loop"
-            if correction.jump_m > _JUMP_M or correction.jump_rad > _JUMP_RAD:
-                self._level.restart()
-                self._count_reset()
+        serial = self.atlas.newest_serial
+        self.crew.submit(lambda: self._settle(k))
         kf = self.atlas.keyframes
+        settled = self.mapping.revision != self._revision
+        self._tell_jump(*moved(frame.R, frame.t, kf.R[k], kf.t[k]))
         frame.R, frame.t = kf.R[k].copy(), kf.t[k].copy()
         frame.point = kf.point[k, : len(frame.features)].copy()
         self._peak = 0
-        self.graph_version += 1
-        return [NewKeyframe(int(kf.serial[k]), inverse(pose(frame.R, frame.t)))], self._graph(reason)
+        if settled:
+            graph = self._corrected()
+        else:
+            self.graph_version += 1
+            graph = self._graph("keyframe" if graph is None else graph.reason)
+        return [NewKeyframe(serial, inverse(pose(frame.R, frame.t)))], graph
+
+    def _settle(self, k: int) -> None:
+        """Do the mapping that a new keyframe asks for."""
+        begin = time.perf_counter()
+        self.mapping.settle(k)
+        if self.config.loop_closing:
+            self.loops.consider(k)
+        self.settled_ms.append((time.perf_counter() - begin) * 1e3)
 
     def _set_anchor(self, frame: Tracked) -> None:
         kf = self.atlas.keyframes
@@ -211,20 +256,26 @@ class Slam:
         if tracked < config.close_tracked_min and untracked > config.close_untracked_max:
             return True
         self._peak = max(self._peak, frame.inliers)
+        if self.crew.waiting >= _BACKLOG:
+            return False
         return frame.inliers < config.keyframe_ratio * self._peak
 
     def polish(self) -> GraphUpdate | None:
-        """Adjust the whole map once, when there is time for it; return the new graph, None when nothing was there."""
-        slots = self.atlas.slots
-        if len(slots) < 2:
+        """Adjust the whole map once, when there is time for it; return the new graph, None when there is none (yet)."""
+        if len(self.atlas.slots) < 2:
             return None
-        self.mapping.adjust_all()
-        self.graph_version += 1
-        return self._graph("full_ba")
+        self._why = "full_ba"
+        self.crew.submit(self.mapping.adjust_all)
+        return self.catch_up()
 
-    def _lost(self, stamp_ns: int) -> TrackResult:
+    def catch_up(self) -> GraphUpdate | None:
+        """Return the graph when mapping has corrected it since the last frame."""
+        with self.crew.frame():
+            return self._catch_up()
+
+    def _lost(self, stamp_ns: int, graph: GraphUpdate | None) -> TrackResult:
         self._step = np.eye(4)
-        return self._result(stamp_ns, "lost", None, [], None)
+        return self._result(stamp_ns, "lost", None, [], graph)
 
     def _graph(self, reason: GraphReason) -> GraphUpdate:
         return GraphUpdate(self.graph_version, reason, tuple(self.keyframe_poses().items()))
@@ -241,7 +292,7 @@ class Slam:
         return TrackResult(
             stamp_ns=stamp_ns, status=status,
             T_map_camera=inverse(pose(frame.R, frame.t)) if frame is not None else None,
-            covariance=map_covariance(frame) if frame is not None else None,
+            covariance=map_covariance(frame.R, frame.information) if frame is not None else None,
             keyframe_id=self._reference if located else None,
             T_keyframe_camera=self._anchor if located else None,
             new_keyframes=new, graph=graph, reset_counter=self.reset_counter, graph_version=self.graph_version,
@@ -250,26 +301,12 @@ class Slam:
 
     def keyframe_poses(self) -> dict[int, F64]:
         """Return T_map_camera (4, 4) of each living keyframe by id, in order of id."""
-        kf = self.atlas.keyframes
-        return {int(kf.serial[k]): inverse(pose(kf.R[k], kf.t[k])) for k in self.atlas.slots}
+        kf, slots = self.atlas.keyframes, self.atlas.slots
+        T = np.tile(np.eye(4), (len(slots), 1, 1))
+        T[:, :3, :3] = kf.R[slots].transpose(0, 2, 1)
+        T[:, :3, 3] = -np.einsum("nba,nb->na", kf.R[slots], kf.t[slots])
+        return dict(zip(kf.serial[slots].tolist(), T, strict=True))
 
     def final_trajectory(self) -> list[tuple[int, F64]]:
         """Return (stamp_ns, T_map_camera) of each tracked frame, placed by what is now known of its keyframe."""
-        log = self._log
-        rows = zip(log.stamp_ns, log.keyframe, log.T_keyframe_camera, strict=True)
-        return [(stamp, self.mapping.keyframe_pose(serial) @ T) for stamp, serial, T in rows]
-
-
-def map_covariance(frame: Tracked) -> F64:
-    """Return the covariance (6, 6) of T_map_camera for a left perturbation in the map frame.
-
-    With T_camera_map -> exp(delta) T_camera_map, the camera's centre moves by -R^T v and its rotation by
-    exp(-R^T w): both blocks turn with R^T.
-    """
-    H = frame.information
-    assert H is not None
-    covariance = np.linalg.inv(H + 1e-6 * np.eye(6))
-    turn = np.zeros((6, 6))
-    turn[:3, :3] = turn[3:, 3:] = frame.R.T
-    out = turn @ covariance @ turn.T
-    return 0.5 * (out + out.T)
+        return [] if self._trail is None else self._trail.placed(self.mapping.keyframe_pose)

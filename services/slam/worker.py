@@ -1,0 +1,164 @@
+"""Who does the mapping: the caller at once (lockstep), or a thread beside tracking (live).
+
+Both run the same jobs. A job touches the map only inside ``step()``, for a millisecond or two; what takes long (bundle
+adjustment, pose graph) works on copies between two steps and is applied by the second. Tracking owns the map inside
+``frame()`` and goes first: a frame waits for at most one step, and finds the map as it was or as it became, never between.
+Frames add keyframes and points; only jobs end or merge them: what a job has copied is still there when it applies it.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import queue
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Protocol
+
+LOG = logging.getLogger(__name__)
+
+Job = Callable[[], None]
+
+_SWITCH_S = 0.0005
+"""How long a thread may keep Python to itself: the default of 5 ms would be added to a frame's time."""
+_NICE = 5
+"""Where cores are few tracking runs first (Linux: per thread)."""
+
+
+class Crew(Protocol):
+    """Runs mapping jobs one after another."""
+
+    def frame(self) -> AbstractContextManager[None]:
+        """Own the map for one frame."""
+        ...
+
+    def step(self) -> AbstractContextManager[None]:
+        """Own the map for one short step of a job; free inside a frame or a step of the same thread."""
+        ...
+
+    def submit(self, job: Job) -> None:
+        """Have a job done, after those submitted before."""
+        ...
+
+    @property
+    def waiting(self) -> int:
+        """Jobs that have not begun."""
+        ...
+
+    def close(self) -> None:
+        """Finish the job at hand and stop."""
+        ...
+
+
+class Inline:
+    """Does each job at once on the caller's thread: the same frames give the same map."""
+
+    waiting = 0
+
+    def frame(self) -> AbstractContextManager[None]:
+        """Return nothing to wait for."""
+        return nullcontext()
+
+    def step(self) -> AbstractContextManager[None]:
+        """Return nothing to wait for."""
+        return nullcontext()
+
+    def submit(self, job: Job) -> None:
+        """Do the job."""
+        job()
+
+    def close(self) -> None:
+        """Nothing runs."""
+
+
+class Beside:
+    """One thread for the jobs. A job's exception is kept and raised by the next ``frame()``: it is a bug, told as one."""
+
+    def __init__(self) -> None:
+        sys.setswitchinterval(_SWITCH_S)
+        self._turn = threading.Condition()
+        self._owner: int | None = None
+        self._frame_waits = False
+        self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
+        self._fault: BaseException | None = None
+        self._unfinished = 0
+        self._thread = threading.Thread(target=self._run, name="mapping", daemon=True)
+        self._thread.start()
+
+    @property
+    def waiting(self) -> int:
+        """Jobs that have not begun."""
+        return self._jobs.qsize()
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is being done and nothing waits."""
+        return self._unfinished == 0
+
+    @contextmanager
+    def frame(self) -> Iterator[None]:
+        """Own the map for one frame, before any step that has not begun.
+
+        Raises:
+            RuntimeError: a job failed.
+        """
+        with self._turn:
+            if self._fault is not None:
+                raise RuntimeError("mapping failed") from self._fault
+            self._frame_waits = True
+            while self._owner is not None:
+                self._turn.wait()
+            self._owner, self._frame_waits = threading.get_ident(), False
+        try:
+            yield
+        finally:
+            self._leave()
+
+    @contextmanager
+    def step(self) -> Iterator[None]:
+        """Own the map for one step."""
+        me = threading.get_ident()
+        if self._owner == me:
+            yield
+            return
+        with self._turn:
+            while self._owner is not None or self._frame_waits:
+                self._turn.wait()
+            self._owner = me
+        try:
+            yield
+        finally:
+            self._leave()
+
+    def _leave(self) -> None:
+        with self._turn:
+            self._owner = None
+            self._turn.notify_all()
+
+    def submit(self, job: Job) -> None:
+        """Queue a job."""
+        with self._turn:
+            self._unfinished += 1
+        self._jobs.put(job)
+
+    def close(self) -> None:
+        """Finish the job at hand, forget the rest and stop."""
+        while not self._jobs.empty():
+            self._jobs.get()
+        self._jobs.put(None)
+        self._thread.join(2.0)
+
+    def _run(self) -> None:
+        if hasattr(os, "setpriority"):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        while (job := self._jobs.get()) is not None:
+            try:
+                job()
+            except Exception as error:
+                LOG.exception("a mapping job failed")
+                self._fault = error
+                return
+            with self._turn:
+                self._unfinished -= 1
