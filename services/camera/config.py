@@ -9,6 +9,34 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from services.camera.depth.config import DepthConfig
 
 
+class RealsenseConfig(BaseModel):
+    """How a RealSense D4xx is set; the defaults are for outdoors, among trees.
+
+    They follow the vendor's tuning advice and were not measured here: there was no camera. Vegetation gives false matches,
+    so the preset that asks for confidence; the projector at full power, because trunks stand in shade; exposure by the
+    camera itself, because light changes as it turns.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    serial: str = ""
+    """Which camera; empty: the first that is found."""
+    rate_hz: Literal[6, 15, 30, 60] = 30
+    preset: Literal["keep", "default", "hand", "high_accuracy", "high_density", "medium_density"] = "high_accuracy"
+    """The device's own depth preset; ``keep`` leaves it as it is."""
+    projector: bool = True
+    laser_power_share: float = Field(default=1.0, ge=0.0, le=1.0)
+    """Of the projector's largest power."""
+    depth_exposure_us: float | None = Field(default=None, gt=0.0)
+    """None: automatic."""
+    colour_exposure_us: float | None = Field(default=None, gt=0.0)
+    """None: automatic."""
+    global_time: bool = True
+    """Stamps by the device's clock, as the library maps it to this machine's; off: the time of arrival."""
+    reopen_every_s: float = Field(default=0.5, gt=0.0, le=10.0)
+    """Pause between tries after the camera was unplugged."""
+
+
 class CameraConfig(BaseModel):
     """Source, range filter and wire formats of the camera service."""
 
@@ -34,6 +62,7 @@ class CameraConfig(BaseModel):
     """Colour images in a ROS bag; empty: the likeliest."""
     bag_depth_topic: str = ""
     """Depth images in a ROS bag; empty: the likeliest, registered ones first."""
+    realsense: RealsenseConfig = RealsenseConfig()
     rate: float = Field(default=1.0, gt=0.0, le=100.0)
     """How much faster than recorded a recording is replayed."""
     restamp: bool = True

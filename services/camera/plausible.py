@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 _STEP_PX = 8
 _OVER_FRAMES = 15
-_LEAST_DATA = 50
+_LEAST_DATA = 12
 _NEAREST_FAR_M = 0.7
 """A scene of which 95 % lie nearer than this for a second is no scene to fly in."""
 _FARTHEST_MEDIAN_M = 15.0
