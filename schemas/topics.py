@@ -96,7 +96,7 @@ ANY = "*"
 
 CAMERA_RGBD = Topic("camera/rgbd", RgbdFrame, "camera", ("slam", "refiner", "navigator", "preview"), 15, 1.0, _H, _LATEST, "data",
                     description="colour and registered depth, raw")  # fmt: skip
-CAMERA_COMPRESSED = Topic("camera/rgbd_compressed", RgbdFrame, "camera", ("recorder",), 0, None, _A, _LATEST, "data_low",
+CAMERA_COMPRESSED = Topic("camera/rgbd_compressed", RgbdFrame, "camera", ("slam", "refiner", "recorder"), 0, None, _A, _LATEST, "data_low",
                           description="the same as JPEG and PNG, sent only while somebody listens")  # fmt: skip
 SLAM_POSE = Topic("slam/pose", Pose, "slam", ("refiner", "detector", "navigator", "autopilot", "simulator", "station", "preview"), 15, 0.5, _R, _STREAM,
                   "interactive_high", radio_hz=5, express=True, description="camera in map for each frame, with covariance")  # fmt: skip

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
+from pathlib import Path
+
 from pydantic import BaseModel, ConfigDict, Field
 
 
@@ -10,6 +14,8 @@ class SlamConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    frames: Literal["raw", "compressed"] = "raw"
+    """Which of the camera's two keys to take: ``compressed`` where the camera is on another machine."""
     features: int = Field(default=1000, ge=100, le=4000)
     """Features kept per frame."""
     levels: int = Field(default=8, ge=1, le=12)
@@ -41,3 +47,15 @@ class SlamConfig(BaseModel):
     """A map of more is adjusted in parts of so many keyframes."""
     loop_closing: bool = True
     relocalise: bool = True
+    new_map_after_s: float = Field(default=30.0, gt=0)
+    """Lost for so long (live), a new map is begun, under a new ``map_id``."""
+    keep_map: bool = True
+    """Live, keyframes are kept on disk as they are made; a slam that was killed goes on with its map."""
+    map_folder: Path | None = None
+    """Where; by default in the state directory of the service or of the user."""
+    map_max_age_s: float = Field(default=600.0, gt=0)
+    """A map whose slam lived longer ago than this is not taken up, nor one from before the machine's last start."""
+    map_file_mb: float = Field(default=256.0, gt=1)
+    """Limit of the file of keyframes (54 KB each)."""
+    relocalise_within_s: float = Field(default=10.0, gt=0)
+    """A map that was taken up, and in which no frame is located for so long, is given up for a new one."""

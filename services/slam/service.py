@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from schemas.camera import Intrinsics, RgbdFrame
 from schemas.slam import Graph, GraphNode, Keyframe, Pose, Transform
-from schemas.topics import CAMERA_RGBD, SLAM_GRAPH, SLAM_KEYFRAME, SLAM_POSE, VEHICLE_STATE
+from schemas.topics import CAMERA_COMPRESSED, CAMERA_RGBD, SLAM_GRAPH, SLAM_KEYFRAME, SLAM_POSE, VEHICLE_STATE
 from schemas.vehicle import VehicleState
 from services.camera.codecs import FrameError, decode_colour, decode_depth_raw, recode
 from services.common.context import Context
@@ -27,7 +27,7 @@ def build(context: Context) -> SlamService:
     """Warm the kernels and register the work; the returned service's ``slam`` holds the final trajectory."""
     warm()
     service = SlamService(context, context.config.slam)
-    context.on(CAMERA_RGBD, service.on_frame)
+    context.on(CAMERA_COMPRESSED if context.config.slam.frames == "compressed" else CAMERA_RGBD, service.on_frame)
     context.on(VEHICLE_STATE, service.on_vehicle)
     context.every(0.5, service.on_idle)
     return service
