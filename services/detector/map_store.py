@@ -11,7 +11,6 @@ from schemas.mapping import MapIndex, Submap
 from services.common.geometry import inverse
 from services.detector.model import Floats, Views
 
-
 _PATIENCE_S = (2.0, 30.0)
 """Least and longest time between two questions for the whole map."""
 
@@ -39,6 +38,8 @@ class MapStore:
         """Points that came, went or moved since ``settle``."""
         self._epoch: int | None = None
         """The run of the mapper whose versions these are; None until an index told."""
+        self._absent: set[int] = set()
+        """Held here, not listed in the last index: gone, or newer than the index."""
         self._patience_s, self._not_before_ns = _PATIENCE_S[0], 0
         self._held: dict[int, _Held] = {}
 
@@ -83,7 +84,7 @@ class MapStore:
     def lacks(self, index: MapIndex, now_ns: int) -> bool:
         """Return whether the mapper holds more or newer than this store, so that the whole is to be asked for.
 
-        What the mapper does not hold any more goes. Asking is answered with yes at most every 2 s, and ever more seldom
+        What the mapper does not hold any more, two indexes in a row, goes. Asking is answered with yes at most every 2 s, and ever more seldom
         (to 30 s) while it does not help. An index of another map is nothing to go by: its submaps come first.
         """
         if index.map_id != self.map_id:
@@ -92,7 +93,9 @@ class MapStore:
             if self._epoch is not None:
                 self._drop(set(self._held))  # versions of another run of the mapper
             self._epoch = index.epoch
-        self._drop(set(self._held) - set(index.submap_ids))
+        absent = set(self._held) - set(index.submap_ids)
+        self._drop(absent & self._absent)
+        self._absent = absent - self._absent
         entries = zip(index.submap_ids, index.versions, index.placed_by, strict=True)
         if all(self._is_as_new(*entry) for entry in entries):
             self._patience_s = _PATIENCE_S[0]

@@ -34,6 +34,8 @@ Matrix = NDArray[np.float64]
 _LOOK_S = 1.0
 _INDEX_S = 5.0
 """Without any change the index is still told so often, for those who missed the last one."""
+_HOLD_S = 3.0
+"""So long keyframes that the saved map knows wait for the graph that tells whether it is slam's map still."""
 
 
 class MapperService:
@@ -56,6 +58,8 @@ class MapperService:
         file = map_file(config.state_dir, context.uav, dict(os.environ), simulated=context.clock.simulated)
         self._keeper = None if file is None else MapKeeper(file, context.health.count, context.health.note)
         self._saved: SavedMap | None = None if self._keeper is None else self._keeper.load()
+        self._held_back: list[Keyframe] = []
+        self._held_since_ns = 0
         context.on(SLAM_KEYFRAME, self.on_keyframe)
         context.on(SLAM_GRAPH, self.on_graph)
         context.every(_LOOK_S, self.on_timer)
@@ -72,6 +76,10 @@ class MapperService:
     def on_keyframe(self, keyframe: Keyframe) -> None:
         """Take up a keyframe, unless it is known or its images are damaged."""
         self._follow_map(keyframe.map_id)
+        if self._may_be_saved(keyframe):
+            self._held_since_ns = self._held_since_ns if self._held_back else self._context.clock.now_ns()
+            self._held_back.append(keyframe)
+            return
         if keyframe.keyframe_id in self.map.submaps:
             self._context.health.count("repeated_keyframes")
             return
@@ -95,11 +103,12 @@ class MapperService:
         """Move the submaps to where the graph now puts their keyframes; an older graph is ignored."""
         self._follow_map(graph.map_id)
         if graph.version < self._graph_version:
-            self._saved = None  # slam began again under an old name
             return
+        self._unsaved |= graph.version > self._graph_version  # a saved map of an older graph may be another slam's
         self._graph_version = graph.version
         self._poses = self._read_poses(graph)
         self._restore(self._poses)
+        self._take_held_back()
         with self._context.health.timed("move"):
             moves = self.map.move(self._poses)
         self._tell(moves.moved, points=False)
@@ -109,6 +118,9 @@ class MapperService:
         """Tell the ground that changed, and what the map holds."""
         if not self.map.map_id:
             return
+        if self._held_back and self._context.clock.now_ns() - self._held_since_ns > _HOLD_S * 1e9:
+            self._saved = None
+            self._take_held_back()
         with self._context.health.timed("ground"):
             patches = self._ground.changes(self.map.submaps, self._occasion())
         for patch in patches:
@@ -179,6 +191,7 @@ class MapperService:
         self._local.clear()
         self._ground.model.clear()
         self._news = True
+        self._held_back = []
         if self._saved is not None and self._saved.map_id != map_id:
             self._saved = None
         for submap in gone:
@@ -195,6 +208,18 @@ class MapperService:
         self.map.restore(back)
         self._context.health.count("submaps_restored", len(back))
         self._tell(back, points=True)
+
+    def _may_be_saved(self, keyframe: Keyframe) -> bool:
+        """Return whether the saved map, not yet taken up or refused, has this keyframe."""
+        saved = self._saved
+        if saved is None or saved.map_id != keyframe.map_id:
+            return False
+        return any(s.submap_id == keyframe.keyframe_id and s.stamp_ns == keyframe.stamp_ns for s in saved.submaps)
+
+    def _take_held_back(self) -> None:
+        waiting, self._held_back = self._held_back, []
+        for keyframe in waiting:
+            self.on_keyframe(keyframe)
 
     def _images(self, keyframe: Keyframe) -> tuple[NDArray[np.float32], NDArray[np.uint8] | None, NDArray[np.float32]]:
         i = keyframe.intrinsics
