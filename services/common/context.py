@@ -63,6 +63,11 @@ class Context(Protocol):
     health: HealthBook
 
     @property
+    def lockstep(self) -> bool:
+        """Whether every message waits for all that the last one caused (in memory), instead of coming in real time."""
+        ...
+
+    @property
     def clock(self) -> Clock:
         """The one clock of the service."""
         ...

@@ -79,6 +79,8 @@ class Hub:
 class MemoryContext:
     """A service's context on a Hub."""
 
+    lockstep = True
+
     def __init__(self, hub: Hub, service: str) -> None:
         self._hub = hub
         self.service = service

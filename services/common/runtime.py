@@ -59,6 +59,8 @@ class _Timer:
 class LiveContext:
     """A service's context over Zenoh; see ``services.common.context.Context`` for what each operation promises."""
 
+    lockstep = False
+
     def __init__(
         self, service: str, config: TreedockConfig, session: zenoh.Session, clock: Clock | None = None
     ) -> None:

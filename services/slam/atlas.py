@@ -61,6 +61,10 @@ class Atlas:
         """Return the serial of the last keyframe made, -1 before the first."""
         return self._serial - 1
 
+    def next_serial(self, serial: int) -> None:
+        """Give the next keyframe this serial; only upward, for a map that is put together again."""
+        self._serial = max(self._serial, serial)
+
     def reserve_points(self, count: int) -> I32:
         """Return ``count`` free point slots, lowest first; they stay free until observed."""
         free = np.flatnonzero(self.points.n == 0)

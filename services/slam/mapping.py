@@ -65,6 +65,12 @@ class Mapping:
         self._create(k)
         return k
 
+    def join(self, k: int, near: I32) -> None:
+        """Have keyframe ``k`` see what keyframes ``near`` see, and make points of its other features."""
+        self.fuse_into(k, points_of(self.atlas.points, self.atlas.keyframes, near))
+        self._create(k)
+        describe_all(self.atlas.points, self.atlas.keyframes, k, self.atlas.scales)
+
     def settle(self, k: int) -> None:
         """Tidy the map around the new keyframe ``k``."""
         atlas = self.atlas

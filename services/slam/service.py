@@ -13,37 +13,50 @@ from services.camera.codecs import FrameError, decode_colour, decode_depth_raw, 
 from services.common.context import Context
 from services.common.geometry import R_BODY_CAMERA, Matrix, rotation_from_quaternion, to_transform
 from services.slam.config import SlamConfig
+from services.slam.keeper import state_folder
+from services.slam.maps import LiveMaps, LockstepMap, Maps
 from services.slam.results import GraphUpdate, TrackResult
 from services.slam.slam import Slam
 from services.slam.warm import warm
 
 _JPEG_QUALITY = 80
 _ATTITUDE_AGE_NS = 200_000_000
-_IDLE_NS = 1_000_000_000
-"""After so long without a frame the map is polished."""
+_IDLE_PERIOD_S = 0.5
+_IDLE_PERIODS = 3
+"""After so many without a frame the map is polished."""
 
 
 def build(context: Context) -> SlamService:
     """Warm the kernels and register the work; the returned service's ``slam`` holds the final trajectory."""
     warm()
-    service = SlamService(context, context.config.slam)
+    service = SlamService(context, context.config.slam, _maps(context))
     context.on(CAMERA_COMPRESSED if context.config.slam.frames == "compressed" else CAMERA_RGBD, service.on_frame)
     context.on(VEHICLE_STATE, service.on_vehicle)
-    context.every(0.5, service.on_idle)
+    context.every_wall(_IDLE_PERIOD_S, service.on_idle)
+    context.on_stop(service.on_stop)
     return service
+
+
+def _maps(context: Context) -> Maps:
+    config = context.config.slam
+    if context.lockstep:
+        return LockstepMap(config)
+    folder = (config.map_folder or state_folder(context.uav)) if config.keep_map else None
+    return LiveMaps(config, folder, context.health)
 
 
 class SlamService:
     """Decodes, calls the core and publishes; keyframe and graph go out before the pose that rests on them."""
 
-    def __init__(self, context: Context, config: SlamConfig) -> None:
+    def __init__(self, context: Context, config: SlamConfig, maps: Maps) -> None:
         self.slam: Slam | None = None
         self._context = context
         self._config = config
+        self._maps = maps
         self._intrinsics: Intrinsics | None = None
         self._up_body: tuple[int, Matrix] | None = None
         self._last_stamp_ns = -1
-        self._last_frame_ns = 0
+        self._idle_periods = 0
         self._polished = True
 
     def on_vehicle(self, state: VehicleState) -> None:
@@ -69,21 +82,36 @@ class SlamService:
             depth_m = depth_raw.astype(np.float32) / np.float32(frame.intrinsics.depth_scale)
             accel = None if frame.accel_camera is None else np.array(frame.accel_camera)
             result = slam.track(frame.stamp_ns, grey, depth_m, accel, self._attitude(frame.stamp_ns))
-        self._last_stamp_ns, self._polished = frame.stamp_ns, False
-        self._last_frame_ns = self._context.clock.now_ns()
-        if result.status == "lost":
+        self._last_stamp_ns, self._polished, self._idle_periods = frame.stamp_ns, False, 0
+        if result.status in {"lost", "relocalising"}:
             health.count("lost_frames")
         self._publish(frame, result)
+        while slam.settled_ms:
+            health.stage_ms["map"].append(slam.settled_ms.popleft())
+        self.slam = self._maps.after(slam, result)
 
     def on_idle(self) -> None:
-        """Polish the map when no frame has come for a while (the end of a recording, a pause)."""
-        if self.slam is None or self._polished or self._context.clock.now_ns() - self._last_frame_ns < _IDLE_NS:
+        """Tell what mapping has done since the last frame; polish when none comes (a recording's end, a pause).
+
+        Counted in periods, not read from the clock: simulated time stands still while nothing comes.
+        """
+        self._maps.beat()
+        if self.slam is None:
             return
-        self._polished = True
-        with self._context.health.timed("polish"):
-            graph = self.slam.polish()
+        self._idle_periods += 1
+        graph = None
+        if not self._polished and self._idle_periods >= _IDLE_PERIODS:
+            self._polished = True
+            with self._context.health.timed("polish"):
+                graph = self.slam.polish()
+        elif self._idle_periods > 1:
+            graph = self.slam.catch_up()
         if graph is not None:
             self._publish_graph(self._last_stamp_ns, graph)
+
+    def on_stop(self) -> None:
+        """End the map."""
+        self._maps.end()
 
     def _decode(self, frame: RgbdFrame) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
         import cv2
@@ -102,8 +130,8 @@ class SlamService:
     def _slam_for(self, frame: RgbdFrame) -> Slam:
         if self.slam is None:
             self._intrinsics = frame.intrinsics
-            # named by its first frame: a slam that was restarted never passes its new map off as the old one
-            self.slam = Slam(frame.intrinsics, self._config, map_id=f"map-{frame.stamp_ns}")
+            # a new map is named by its first frame: a restarted slam never passes it off as the old one
+            self.slam = self._maps.begin(frame.intrinsics, frame.stamp_ns)
         return self.slam
 
     def _attitude(self, stamp_ns: int) -> Matrix | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,6 +82,12 @@ class Slam:
         self._why: GraphReason = "local_ba"
         self.settled_ms: deque[float] = deque(maxlen=1000)
         """How long mapping took over each keyframe."""
+        self.on_made: Callable[[int], None] | None = None
+        """Called by the crew with the slot of each new keyframe, and after its mapping: for who keeps the map."""
+        self.on_settled: Callable[[], None] | None = None
+        self._era0 = 0
+        self._taken_up = False
+        """The map is from an earlier life, and no frame has been located in it yet."""
 
     def track(
         self,
@@ -104,6 +111,7 @@ class Slam:
             frame = self._locate(features)
             if frame is None and self.config.relocalise:
                 frame = self._relocalise(features)
+                graph = self._catch_up() or graph
             if frame is None:
                 return self._lost(stamp_ns, graph)
             levelled = self._level_map(stamp_ns, frame, accel_camera, attitude_up_camera)
@@ -185,6 +193,9 @@ class Slam:
         """Return the frame located anywhere in the map; that is a jump, and told as one."""
         frame = self.loops.relocate(features)
         if frame is not None:
+            if self._taken_up:
+                self._taken_up, self._why = False, "restored"
+                self.mapping.revision += 1
             self._last = None
             self._step = np.eye(4)
             self._level.restart()
@@ -233,10 +244,24 @@ class Slam:
     def _settle(self, k: int) -> None:
         """Do the mapping that a new keyframe asks for."""
         begin = time.perf_counter()
+        if self.on_made is not None:
+            self.on_made(k)
         self.mapping.settle(k)
         if self.config.loop_closing:
             self.loops.consider(k)
+        if self.on_settled is not None:
+            self.on_settled()
         self.settled_ms.append((time.perf_counter() - begin) * 1e3)
+
+    @property
+    def era(self) -> int:
+        """Up whenever the map as a whole was turned or bent: poses of another era are of another frame."""
+        return self._era0 + self.mapping.turns + self.loops.closed
+
+    def resume(self, map_id: str, graph_version: int, reset_counter: int, up_sigma_rad: float, era: int) -> None:
+        """Go on with a map that was put into the atlas: nothing is told of it until a frame is located in it."""
+        self.map_id, self.graph_version, self.reset_counter = map_id, graph_version, reset_counter
+        self.up_sigma_rad, self._era0, self._taken_up = up_sigma_rad, era, True
 
     def _set_anchor(self, frame: Tracked) -> None:
         kf = self.atlas.keyframes
@@ -275,7 +300,7 @@ class Slam:
 
     def _lost(self, stamp_ns: int, graph: GraphUpdate | None) -> TrackResult:
         self._step = np.eye(4)
-        return self._result(stamp_ns, "lost", None, [], graph)
+        return self._result(stamp_ns, "relocalising" if self._taken_up else "lost", None, [], graph)
 
     def _graph(self, reason: GraphReason) -> GraphUpdate:
         return GraphUpdate(self.graph_version, reason, tuple(self.keyframe_poses().items()))

@@ -1,0 +1,211 @@
+"""A map's keyframes on disk: an append-only log of records, and beside it the latest map as a whole.
+
+A record is a magic word, its kind, length and CRC-32, then its body. What is torn or damaged anywhere is passed over:
+reading goes on at the next magic word. The first record is the header; a file without one is no map. The whole map is
+written beside its old one and renamed over it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.common.files import make_folder, write_whole
+
+F64 = NDArray[np.float64]
+Arrays = dict[str, NDArray]
+
+HEADER, KEYFRAME, BEAT = b"H", b"K", b"B"
+FORMAT = 1
+_MAGIC = b"\x9dTDK"
+_HEAD = struct.Struct("<4sccxxII")
+_NUMBERS = struct.Struct("<iiiqQ12d")
+_COLUMNS = (
+    ("uv", np.float32, 2), ("octave", np.uint8, 0), ("angle", np.float32, 0), ("desc", np.uint64, 4),
+    ("depth", np.float32, 0), ("info", np.float32, 0), ("far", np.bool_, 0),
+)  # fmt: skip
+_MOST_BODY = 1 << 22
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """Whose map it is; all of it must agree before the map is taken up again."""
+
+    map_id: str
+    boot: str
+    """The machine's boot: its clock of ages starts anew with each."""
+    camera: str
+    """Intrinsics and what of the configuration shapes the arrays, as one text."""
+
+
+@dataclass(frozen=True, slots=True)
+class StoredKeyframe:
+    """One keyframe as it was made."""
+
+    serial: int
+    era: int
+    """Of the map's frame: turned or bent at a loop, it is another."""
+    graph_version: int
+    age_ns: int
+    """The machine's clock since boot."""
+    R: F64
+    t: F64
+    columns: Arrays
+    """Features (N first) by name."""
+
+
+def encode_keyframe(k: StoredKeyframe) -> bytes:
+    """Return the body of a keyframe's record."""
+    count = len(k.columns["uv"])
+    head = _NUMBERS.pack(k.serial, k.era, count, k.graph_version, k.age_ns, *k.R.ravel(), *k.t)
+    return head + b"".join(np.ascontiguousarray(k.columns[name], dtype=kind).tobytes() for name, kind, _ in _COLUMNS)
+
+
+def decode_keyframe(body: bytes) -> StoredKeyframe:
+    """Return the keyframe of a record whose checksum was right."""
+    serial, era, count, version, age_ns, *pose = _NUMBERS.unpack_from(body)
+    at, columns = _NUMBERS.size, {}
+    for name, kind, width in _COLUMNS:
+        size = count * max(width, 1)
+        flat = np.frombuffer(body, kind, size, at)
+        columns[name] = flat.reshape(count, width) if width else flat
+        at += flat.nbytes
+    R, t = np.array(pose[:9]).reshape(3, 3), np.array(pose[9:])
+    return StoredKeyframe(serial, era, version, age_ns, R, t, columns)
+
+
+def record(kind: bytes, body: bytes) -> bytes:
+    """Return a whole record."""
+    return _HEAD.pack(_MAGIC, kind, b"\0", len(body), zlib.crc32(kind + body)) + body
+
+
+def records(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Yield kind and body of each sound record."""
+    at = data.find(_MAGIC)
+    while 0 <= at <= len(data) - _HEAD.size:
+        _, kind, _, size, check = _HEAD.unpack_from(data, at)
+        body = data[at + _HEAD.size : at + _HEAD.size + size] if size <= _MOST_BODY else b""
+        if len(body) == size and zlib.crc32(kind + body) == check:
+            yield kind, body
+            at = data.find(_MAGIC, at + _HEAD.size + size)
+        else:
+            at = data.find(_MAGIC, at + 1)
+
+
+class Store:
+    """The two files of one folder."""
+
+    def __init__(self, folder: Path, most_bytes: int) -> None:
+        self._log = folder / "keyframes.log"
+        self._whole = folder / "map.npz"
+        self._folder = folder
+        self._most_bytes = most_bytes
+        self._size = 0
+
+    @property
+    def full(self) -> bool:
+        """Whether the log has reached its limit."""
+        return self._size >= self._most_bytes
+
+    def begin(self, header: Header) -> None:
+        """Throw away what is there and begin the log of a map.
+
+        Raises:
+            InputError: the folder cannot be made or written.
+        """
+        make_folder(self._folder)
+        self.end()
+        first = record(HEADER, json.dumps({"format": FORMAT, **asdict(header)}).encode())
+        write_whole(self._log, first)
+        self._size = len(first)
+
+    def append(self, kind: bytes, body: bytes) -> None:
+        """Add a record and flush it to the disk; nothing is added beyond the limit.
+
+        Raises:
+            OSError: the disk refused.
+        """
+        data = record(kind, body)
+        if self._size + len(data) > self._most_bytes:
+            self._size = self._most_bytes
+            return
+        handle = os.open(self._log, os.O_WRONLY | os.O_APPEND)
+        try:
+            os.write(handle, data)
+            os.fdatasync(handle)
+        finally:
+            os.close(handle)
+        self._size += len(data)
+
+    def keep_only(self, serials: set[int]) -> None:
+        """Write the log anew with only the keyframes ``serials``.
+
+        Raises:
+            InputError: the disk refused; the log is as it was.
+        """
+        parts = []
+        for kind, body in records(self._log.read_bytes()):
+            if kind == HEADER or (kind == KEYFRAME and _NUMBERS.unpack_from(body)[0] in serials):
+                parts.append(record(kind, body))
+        data = b"".join(parts)
+        write_whole(self._log, data)
+        self._size = len(data)
+
+    def write_map(self, arrays: Arrays) -> None:
+        """Replace the map as a whole.
+
+        Raises:
+            InputError: the disk refused; the old one is as it was.
+        """
+        buffer = BytesIO()
+        np.savez(buffer, **arrays)  # type: ignore[arg-type]  # the stub takes allow_pickle for one of them
+        body = buffer.getvalue()
+        write_whole(self._whole, struct.pack("<I", zlib.crc32(body)) + body)
+
+    def read(self) -> tuple[Header | None, list[StoredKeyframe], int]:
+        """Return the header, the keyframes in order and the latest sign of life (clock since boot); sound records only."""
+        header, keyframes, last_ns = None, [], 0
+        try:
+            data = self._log.read_bytes()
+        except OSError:
+            return None, [], 0
+        for kind, body in records(data):
+            if kind == HEADER and header is None:
+                header = _header(body)
+            elif kind == KEYFRAME:
+                keyframes.append(decode_keyframe(body))
+                last_ns = max(last_ns, keyframes[-1].age_ns)
+            elif kind == BEAT:
+                last_ns = max(last_ns, struct.unpack("<Q", body)[0])
+        self._size = len(data)
+        return header, keyframes, last_ns
+
+    def read_map(self) -> Arrays:
+        """Return the map as a whole; empty when there is none that is sound."""
+        try:
+            data = self._whole.read_bytes()
+        except OSError:
+            return {}
+        if len(data) < 4 or zlib.crc32(data[4:]) != struct.unpack("<I", data[:4])[0]:
+            return {}
+        with np.load(BytesIO(data[4:]), allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+
+    def end(self) -> None:
+        """Throw the map away: whoever starts next begins anew."""
+        self._log.unlink(missing_ok=True)
+        self._whole.unlink(missing_ok=True)
+
+
+def _header(body: bytes) -> Header | None:
+    fields = json.loads(body)
+    return Header(**fields) if fields.pop("format") == FORMAT else None
