@@ -14,6 +14,7 @@ from schemas.trees import Target, Tree, TreeList
 from services.camera.codecs import FrameError, decode_depth
 from services.common.context import Context
 from services.common.geometry import Matrix, from_transform
+from services.detector.refine.agreement import Colour
 from services.detector.refine.config import RefinerConfig
 from services.detector.refine.model import Depth, ExpectedTree
 from services.detector.refine.state import TargetState
@@ -118,7 +119,11 @@ class RefinerService:
             return TargetState("none", note=fault or f"no trees of map {pose.map_id} yet")
         T = from_transform(pose.T_map_camera) if pose.T_map_camera is not None else None
         note = fault or ("" if T is not None else f"slam is {pose.status}")
-        return self._tracker.step(frame.stamp_ns, depth, frame.intrinsics, T, covariance_of(pose), note)
+        state = self._tracker.step(
+            frame.stamp_ns, depth, frame.intrinsics, T, covariance_of(pose), note, colour_of(frame)
+        )
+        self._health.note("depth against colour", self._tracker.camera_fault)
+        return state
 
 
 def expected_tree(tree: Tree) -> ExpectedTree:
@@ -144,6 +149,14 @@ def depth_of(frame: RgbdFrame) -> tuple[Depth | None, str]:
         )
     ray_table(i)
     return np.multiply(raw, np.float32(1.0 / i.depth_scale), dtype=np.float32), ""
+
+
+def colour_of(frame: RgbdFrame) -> Colour | None:
+    """Return the colour image (H, W, 3) when it is raw; to decode one for the sake of a check would cost too much."""
+    i = frame.intrinsics
+    if frame.colour_encoding != "bgr8" or len(frame.colour) != 3 * i.width * i.height:
+        return None
+    return np.frombuffer(frame.colour, np.uint8).reshape(i.height, i.width, 3)
 
 
 def covariance_of(pose: Pose) -> Matrix | None:

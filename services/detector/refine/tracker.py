@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from schemas.camera import Intrinsics
-from services.detector.refine.choose import in_view, nearest_in_view
+from services.detector.refine.agreement import Colour, ColourAgreement
+from services.detector.refine.choose import image_place, in_view, nearest_in_view
 from services.detector.refine.config import RefinerConfig
 from services.detector.refine.correction import Correction
 from services.detector.refine.kalman import TargetFilter
@@ -21,6 +23,7 @@ from services.detector.refine.view import bearing_of_column, place_in_map, pose_
 _MAX_DT_S = 1.0
 _STALE_POSE_COVARIANCE = np.diag([0.1, 0.1, 0.05, 0.03, 0.03, 0.06]) ** 2
 """Of a pose that is up to ``lost_after_s`` old."""
+_MIN_SPEED_DT_NS, _MAX_SPEED_DT_NS = 90_000_000, 250_000_000
 _MOVED_M = 0.10
 """A tree that a new list moves by more than this is measured afresh."""
 
@@ -42,6 +45,13 @@ class RefinerTracker:
         self._stamp_ns = 0
         self._seen_ns = 0
         self._pose: tuple[int, Matrix] | None = None
+        self._recent: deque[tuple[int, Matrix]] = deque(maxlen=8)
+        self._agreement = ColourAgreement(config.agreement)
+
+    @property
+    def camera_fault(self) -> str:
+        """Return what is wrong between depth and colour, empty when nothing is known to be."""
+        return self._agreement.fault
 
     @property
     def map_id(self) -> str:
@@ -72,12 +82,14 @@ class RefinerTracker:
         """Begin with a new map: nothing known of the old one holds in it."""
         self._trees, self._suitable, self._corrections = {}, set(), {}
         self._map_id, self._chosen, self._pose = map_id, None, None
+        self._recent.clear()
         self._forget_target()
 
     def pose_jumped(self) -> None:
         """Slam corrected the pose by a jump: places in map from before it say nothing about the next image."""
         self._place_map_m = None
         self._corrections = {}
+        self._recent.clear()
 
     def choose(self, tree_id: int | None) -> None:
         """Follow this tree; None: the nearest suitable one in view."""
@@ -91,7 +103,7 @@ class RefinerTracker:
 
     def step(
         self, stamp_ns: int, depth_m: Depth | None, intrinsics: Intrinsics, T_map_camera: Matrix | None,
-        pose_covariance: Matrix | None, reason: str = "",
+        pose_covariance: Matrix | None, reason: str = "", colour: Colour | None = None,
     ) -> TargetState:  # fmt: skip
         """Return what is known of the target after the frame of ``stamp_ns``.
 
@@ -103,6 +115,7 @@ class RefinerTracker:
                 find the trunk again in the camera's own frame, and no place in the map is given.
             pose_covariance: (6, 6) of the pose.
             reason: Why depth or pose is missing, for the note.
+            colour: (H, W, 3) of the frame, where it is at hand: depth that shows another moment is then noticed.
         """
         known_pose = T_map_camera is not None
         T, covariance = self._usable_pose(stamp_ns, T_map_camera, pose_covariance)
@@ -118,6 +131,11 @@ class RefinerTracker:
         measured = None
         if depth_m is not None:
             measured = self._measure(depth_m, intrinsics, T, covariance, target)
+        if measured is not None and colour is not None:
+            speed = self._image_speed(target, stamp_ns, intrinsics) if known_pose else None
+            refusal = self._agreement.see(stamp_ns, colour, measured.edges_px, speed)
+            if refusal:
+                measured, reason = None, refusal
         believed = measured is not None and self._take(measured, T, intrinsics, stamp_ns, known_pose)
         return self._state(stamp_ns, measured if believed else None, T, covariance, intrinsics, known_pose, reason)
 
@@ -126,6 +144,7 @@ class RefinerTracker:
     ) -> tuple[Matrix | None, Matrix | None]:
         if T_map_camera is not None:
             self._pose = (stamp_ns, T_map_camera)
+            self._recent.append(self._pose)
             return T_map_camera, covariance
         if self._pose is None or stamp_ns - self._pose[0] > self._config.filter.lost_after_s * 1e9:
             return None, None
@@ -150,6 +169,20 @@ class RefinerTracker:
             self._filter, self._place_map_m = None, None
             return None
         return tree
+
+    def _image_speed(self, tree: ExpectedTree, stamp_ns: int, intrinsics: Intrinsics) -> float | None:
+        """Return how fast the camera's motion lately moved the tree in the image, px/s; None when that is not known.
+
+        Over a tenth of a second, as the jitter of two poses in a row says little.
+        """
+        past = [(t, T) for t, T in self._recent if _MIN_SPEED_DT_NS <= stamp_ns - t < _MAX_SPEED_DT_NS]
+        if not past or self._pose is None:
+            return None
+        then_ns, T_then = past[-1]
+        now, then = image_place(tree, self._pose[1], intrinsics), image_place(tree, T_then, intrinsics)
+        if now is None or then is None:
+            return None
+        return (now[0] - then[0]) / ((stamp_ns - then_ns) * 1e-9)
 
     def _forget_target(self) -> None:
         self._target, self._filter, self._place_map_m, self._seen_ns = None, None, None, 0

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from schemas.camera import Intrinsics
+from services.detector.refine import kernels_colour
+from services.detector.refine.agreement import ColourAgreement
 from services.detector.refine.config import RefinerConfig
 from services.detector.refine.kalman import TargetFilter
 from services.detector.refine.model import ExpectedTree
@@ -22,6 +24,10 @@ def warm() -> None:
     depth[:, np.abs(x) < 0.095] = column[np.abs(x) < 0.095]
     tree = ExpectedTree(0, 2.0, 0.0, 0.0, (0.0, 0.0, 1.0), 0.2, 0.05, 0.01)
     refine(depth, intrinsics, _LEVEL, np.eye(6) * 1e-4, tree, [], RefinerConfig())
+    agreement = ColourAgreement(RefinerConfig().agreement)
+    edges = np.array([[row, 20, 40] for row in range(48)], dtype=np.int64)
+    agreement.see(0, np.frombuffer(bytes(48 * 64 * 3), np.uint8).reshape(48, 64, 3), edges, 0.0)
+    kernels_colour.best_offset(np.ones((2, 97)), 6, np.empty(3))
     filters = TargetFilter((0.0, 2.0, 0.1), (1.0, 1e-4, 1e-4), RefinerConfig().filter)
     filters.predict(0.1, (0.0, 0.0), 50.0)
     filters.update((0.0, 2.0, 0.1), (1.0, 1e-4, 1e-4))
