@@ -24,14 +24,19 @@ from schemas.trees import TreeList
 from services.common.bus import Bus
 from services.common.health import HealthReporter
 from services.common.runtime import LiveContext
+from services.inventory.export import csv_bytes, geojson_bytes, tree_rows
+from services.inventory.keeper import Keeper, Tone
+from services.inventory.store import open_store
+from services.inventory.values import AuditLine
 from services.navigator.client import send_command
 from services.station.aircraft import Aircraft
 from services.station.brain import Brain, Outgoing
+from services.station.events import Event
 from services.station.guard import Guard
 from services.station.preview import frame_of, jpeg_fault
 from services.station.requests import Request
 from services.station.server import WebServer, bound_socket
-from services.station.web import Site
+from services.station.web import Download, Site
 
 LOG = logging.getLogger(__name__)
 
@@ -56,8 +61,9 @@ class Station:
         self._strangers: set[str] = set()
         self._reporter = HealthReporter("station", context.health)
         self._pool = ThreadPoolExecutor(_ORDERS_AT_ONCE, thread_name_prefix="order")
+        self.keeper = self._keeper()
         token = self._token()
-        self.site = Site(self.config, Guard(token, local=self.config.local), _Ears(self), {})
+        self.site = Site(self.config, Guard(token, local=self.config.local), _Ears(self), self._downloads())
         self.brain = Brain(self.config, self.site, self._send_order, time.time_ns)
         self._server = WebServer(self.site, self.config, bound_socket(self.config.host, self.config.port))
         self.address = self._address(token)
@@ -67,6 +73,44 @@ class Station:
         if self.config.local or self.config.tls_client_ca:
             return self.config.token
         return self.config.token or secrets.token_urlsafe(24)
+
+    # -- the inventory
+
+    def _keeper(self) -> Keeper | None:
+        """Open the inventory; without one (``none``) the station keeps nothing."""
+        config = self.config.inventory
+        if config.database == "none":
+            return None
+        return Keeper(open_store(config.database), config, self._on_inventory)
+
+    def _on_inventory(self, text: str, tone: Tone) -> None:
+        self.call(lambda: self._tell_inventory(text, tone))
+
+    def _tell_inventory(self, text: str, tone: Tone) -> None:
+        self.brain.log.add("", "inventory", tone, text)
+        if tone != "info":
+            self._context.health.note("inventory", text if tone == "bad" else "")
+
+    def _audit(self, event: Event) -> None:
+        assert self.keeper is not None
+        self.keeper.audit(AuditLine(event.time_ns, event.uav, event.kind, event.level, event.who, event.text))
+
+    def _downloads(self) -> dict[str, Download]:
+        if self.keeper is None:
+            return {}
+        database = self.config.inventory.database
+
+        def rows() -> list[dict[str, Any]]:
+            store = open_store(database, read_only=True)
+            try:
+                return tree_rows(*(store.rows(name) for name in ("trees", "trees_local", "sites")))
+            finally:
+                store.close()
+
+        return {
+            "trees.csv": lambda: (csv_bytes(rows()), "text/csv; charset=utf-8"),
+            "trees.geojson": lambda: (geojson_bytes(rows()), "application/geo+json"),
+        }
 
     def _address(self, token: str) -> str:
         scheme = "https" if self.config.tls_certificate else "http"
@@ -85,6 +129,9 @@ class Station:
         c.every_wall(1.0 / self.config.page_hz, lambda: self.brain.tell_state(time.monotonic()))
         c.every_wall(1.0, self._each_second)
         c.on_stop(self._stop)
+        if self.keeper is not None:
+            self.brain.log.listeners.append(self._audit)
+            self.keeper.start()
         self._server.start()
         LOG.info("the page is at %s", self.address)
 
@@ -130,13 +177,31 @@ class Station:
             return
         name = key.split("/", 3)[3]
         aircraft.links.note(topic, name, time.monotonic(), getattr(message, "seq", None))
+        before = aircraft.mission
         take(aircraft, message)
         self._context.health.count("messages")
+        now = aircraft.mission
+        if (
+            now is not before
+            and now is not None
+            and before is not None
+            and now.visited_tree_ids != before.visited_tree_ids
+        ):
+            self._keep(aircraft)
 
     def _on_trees(self, aircraft: Aircraft, message: TreeList) -> None:
         aircraft.links.note(TREES_LIST, TREES_LIST.name, time.monotonic(), None)
         self._context.health.count("messages")
-        aircraft.on_trees(message)
+        if aircraft.on_trees(message):
+            self._keep(aircraft)
+
+    def _keep(self, aircraft: Aircraft) -> None:
+        """Offer the newest list to the inventory, with the trees docked at in the same map."""
+        mission, trees = aircraft.mission, aircraft.trees
+        if self.keeper is not None and trees is not None:
+            same = mission is not None and mission.map_id == trees.map_id
+            visited = mission.visited_tree_ids if mission is not None and same else ()
+            self.keeper.offer(aircraft.uav, trees, frozenset(visited))
 
     def _subscribe_preview(self, bus: Bus, uav: str) -> None:
         """Pass JPEGs on to the pages as they come; they are checked, never decoded here."""
@@ -182,6 +247,8 @@ class Station:
         self._context.health.counters["slow_pages"] = self.site.cut_off
 
     def _stop(self) -> None:
+        if self.keeper is not None:
+            self.keeper.close()
         self._server.stop()
         self._pool.shutdown(wait=False, cancel_futures=True)
 

@@ -1,0 +1,312 @@
+"""The inventory in memory: takes the lists of flights, joins trees, and says what must be written. Pure.
+
+A flight's tree is linked to a tree of the inventory once and keeps the link, whatever the list says later: trees never
+jump. Trees of one flight are never joined with each other, the detector has told them apart already. Flights are joined
+once the pattern of their trees says how one lies on the other; until then each has trees of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from schemas.trees import Tree, TreeList
+from services.inventory.align import Alignment, Prior, align
+from services.inventory.config import InventoryConfig, StartPoint
+from services.inventory.geodesy import TangentPlane, place_of_start
+from services.inventory.merge import Spots, assign, fuse
+from services.inventory.values import (
+    Belief,
+    Changes,
+    Contents,
+    Flight,
+    InventoryTree,
+    Measurement,
+    Rigid2,
+    Sighting,
+    Site,
+)
+
+_RAN_BACK_NS = 5_000_000_000
+_PRIOR_SIGMAS = 3.0
+_WRITE_MOVE_M = 0.002
+_WRITE_RADIUS_M = 0.0005
+_WRITE_EVERY_NS = 10_000_000_000
+
+
+class Inventory:
+    """All flights, sightings and trees. ``take`` changes it; ``changes`` collects what to write until ``written``."""
+
+    def __init__(self, config: InventoryConfig, contents: Contents | None = None) -> None:
+        contents = contents or Contents()
+        self._config = config
+        self.sites = {site.number: site for site in contents.sites}
+        self.flights = {flight.fid: flight for flight in contents.flights}
+        self.trees = {tree.fid: tree for tree in contents.trees}
+        self.sightings = {sighting.fid: sighting for sighting in contents.sightings}
+        self._of_flight: dict[int, dict[int, Sighting]] = {fid: {} for fid in self.flights}
+        self._of_tree: dict[int, dict[int, Sighting]] = {fid: {} for fid in self.trees}
+        for sighting in self.sightings.values():
+            self._of_flight[sighting.flight][sighting.tree_id] = sighting
+            self._of_tree.setdefault(sighting.tree, {})[sighting.fid] = sighting
+        self._next_tree = max(self.trees, default=0) + 1
+        self._next_sighting = max(self.sightings, default=0) + 1
+        self._tried: dict[tuple[int, int], tuple[int, int]] = {}
+        self.changes = Changes()
+
+    def written(self) -> Changes:
+        """Return what must be written and begin anew."""
+        changes, self.changes = self.changes, Changes()
+        return changes
+
+    # -- flights
+
+    def take(self, uav: str, trees: TreeList, now_ns: int, visited: frozenset[int] = frozenset()) -> Flight:
+        """Take a flight's newest list; ``visited``: ids that the aircraft has docked at. Older lists change nothing."""
+        flight = self._flight(uav, trees, now_ns)
+        if trees.stamp_ns < flight.stamp_ns:
+            return flight
+        flight.stamp_ns, flight.version, flight.last_ns = trees.stamp_ns, trees.version, now_ns
+        self.changes.flights[flight.fid] = flight
+        seen = self._of_flight[flight.fid]
+        fresh = [tree for tree in trees.trees if tree.id not in seen]
+        self._link_new(flight, fresh, now_ns)
+        touched = self._update(flight, trees, now_ns)
+        self._withdraw(flight, trees, touched)
+        for tree_id in visited & seen.keys():
+            tree = self.trees[seen[tree_id].tree]
+            if not tree.visited:
+                tree.visited = True
+                touched.add(tree.fid)
+        for fid in sorted(touched):
+            self._refresh(fid, now_ns)
+        if not flight.aligned:
+            self._try_align(flight, now_ns)
+        return flight
+
+    def _flight(self, uav: str, trees: TreeList, now_ns: int) -> Flight:
+        """Return the flight of a list: known, or a new run when its time ran back (a simulation that began anew)."""
+        same = [f for f in self.flights.values() if f.uav == uav and f.map_id == trees.map_id]
+        newest = max(same, key=lambda f: f.run, default=None)
+        if newest is not None and trees.stamp_ns > newest.stamp_ns - _RAN_BACK_NS:
+            return newest
+        fid = max(self.flights, default=0) + 1
+        run = 1 if newest is None else newest.run + 1
+        flight = self._new_flight(fid, uav, trees.map_id, run, now_ns)
+        self.flights[fid] = self.changes.flights[fid] = flight
+        self._of_flight[fid] = {}
+        return flight
+
+    def _new_flight(self, fid: int, uav: str, map_id: str, run: int, now_ns: int) -> Flight:
+        start = self._config.start_of(uav)
+        if start is None:
+            site = self._new_site("local")
+            return Flight(fid, uav, map_id, run, "local", site.number, Rigid2(), 0.0, 0.0, aligned=False,
+                          first_ns=now_ns, last_ns=now_ns, note="no start point: local coordinates")  # fmt: skip
+        site = next((s for s in self.sites.values() if s.frame == "global"), None) or self._new_site("global", start)
+        plane = TangentPlane(site.latitude_deg, site.longitude_deg, site.altitude_m)
+        place = place_of_start(plane, start.latitude_deg, start.longitude_deg, start.altitude_m, start.heading_deg)
+        first = not any(f.site == site.number for f in self.flights.values())
+        return Flight(fid, uav, map_id, run, "global", site.number, place, start.sigma_m,
+                      math.radians(start.sigma_heading_deg), aligned=first, first_ns=now_ns, last_ns=now_ns,
+                      note="first of its site" if first else "placed by its start point")  # fmt: skip
+
+    def _new_site(self, frame: str, start: StartPoint | None = None) -> Site:
+        number = max(self.sites, default=0) + 1
+        if start is None:
+            site = Site(number, "local")
+        else:
+            site = Site(number, "global", start.latitude_deg, start.longitude_deg, start.altitude_m)
+        assert site.frame == frame
+        self.sites[number] = self.changes.sites[number] = site
+        return site
+
+    # -- trees
+
+    def _link_new(self, flight: Flight, fresh: list[Tree], now_ns: int) -> None:
+        """Give each tree that is new to the flight a tree of the inventory: a known one where the flight lies on it."""
+        beliefs = [belief_of(tree) for tree in fresh]
+        partners: list[int | None] = [None] * len(fresh)
+        if flight.aligned or self._precise(flight):
+            candidates = self._others(flight)
+            found = assign(self._placed(flight, beliefs), self._known(candidates), self._config)
+            partners = [candidates[k].fid if k >= 0 else None for k in found]
+        for tree, belief, partner in zip(fresh, beliefs, partners, strict=True):
+            fid = partner if partner is not None else self._new_tree(flight, now_ns)
+            number = self._next_sighting
+            self._next_sighting += 1
+            sighting = Sighting(number, flight.fid, tree.id, fid, belief)
+            self.sightings[number] = self.changes.sightings[number] = sighting
+            self._of_flight[flight.fid][tree.id] = sighting
+            self._of_tree.setdefault(fid, {})[number] = sighting
+
+    def _precise(self, flight: Flight) -> bool:
+        """Whether the start point alone is good enough to tell trunks apart, at 10 m from it."""
+        reach = math.hypot(flight.sigma_m, 10.0 * flight.sigma_heading_rad)
+        return flight.frame == "global" and 2.0 * reach < self._config.merge_m
+
+    def _others(self, flight: Flight) -> list[InventoryTree]:
+        """Return the site's trees that the flight has no part in yet."""
+        own = {sighting.tree for sighting in self._of_flight[flight.fid].values()}
+        return [t for t in self.trees.values() if t.site == flight.site and t.status != "merged" and t.fid not in own]
+
+    def _placed(self, flight: Flight, beliefs: list[Belief]) -> Spots:
+        at = [flight.place.apply(b.x_m, b.y_m, b.z_m) for b in beliefs]
+        return Spots.of([(x, y, b.radius_m, b.sigma_xy_m, b.sigma_radius_m)
+                         for (x, y, _), b in zip(at, beliefs, strict=True)])  # fmt: skip
+
+    @staticmethod
+    def _known(trees: list[InventoryTree]) -> Spots:
+        return Spots.of([(t.x_m, t.y_m, t.radius_m, t.sigma_xy_m, t.sigma_radius_m) for t in trees])
+
+    def _new_tree(self, flight: Flight, now_ns: int) -> int:
+        fid = self._next_tree
+        self._next_tree += 1
+        self.trees[fid] = InventoryTree(
+            fid, flight.frame, flight.site, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, suitable=False,
+            status="present", merged_into=None, first_ns=now_ns, last_ns=now_ns,
+        )  # fmt: skip
+        self._of_tree[fid] = {}
+        return fid
+
+    def _update(self, flight: Flight, trees: TreeList, now_ns: int) -> set[int]:
+        """Take the new beliefs and keep those worth keeping in the history; return the trees they touch."""
+        touched: set[int] = set()
+        seen = self._of_flight[flight.fid]
+        for tree in trees.trees:
+            sighting = seen[tree.id]
+            before, now = sighting.belief, belief_of(tree)
+            fresh = sighting.kept is None
+            if now == before and sighting.present and not fresh:
+                continue
+            if self._worth_keeping(sighting, now, now_ns):
+                self._keep(flight, sighting, now, now_ns, trees.stamp_ns)
+            elif sighting.present and not _moved(before, now, _WRITE_MOVE_M, _WRITE_RADIUS_M):
+                continue  # written with the next that matters: the belief is the same for every use
+            sighting.belief, sighting.present = now, True
+            self.changes.sightings[sighting.fid] = sighting
+            touched.add(sighting.tree)
+        return touched
+
+    def _worth_keeping(self, sighting: Sighting, now: Belief, now_ns: int) -> bool:
+        kept, c = sighting.kept, self._config
+        if kept is None or kept.suitable != now.suitable:
+            return True
+        if _moved(kept, now, c.history_move_m, c.history_radius_m):
+            return now_ns - sighting.kept_ns >= 1_000_000_000
+        return now.observations > kept.observations and now_ns - sighting.kept_ns >= c.history_every_s * 1e9
+
+    def _keep(self, flight: Flight, sighting: Sighting, belief: Belief, now_ns: int, stamp_ns: int) -> None:
+        x, y, _ = flight.place.apply(belief.x_m, belief.y_m, belief.z_m)
+        sighting.kept, sighting.kept_ns = belief, now_ns
+        self.changes.measurements.append(Measurement(sighting.fid, sighting.tree, now_ns, stamp_ns, belief, x, y))
+
+    def _withdraw(self, flight: Flight, trees: TreeList, touched: set[int]) -> None:
+        """Mark what the list no longer holds; a tree that no flight's list holds any more stays, as withdrawn."""
+        listed = {tree.id for tree in trees.trees}
+        for tree_id, sighting in self._of_flight[flight.fid].items():
+            if sighting.present and tree_id not in listed:
+                sighting.present = False
+                self.changes.sightings[sighting.fid] = sighting
+                touched.add(sighting.tree)
+
+    def _refresh(self, fid: int, now_ns: int) -> None:
+        """Compute a tree anew from its flights' beliefs."""
+        tree = self.trees[fid]
+        if tree.status == "merged":
+            return
+        parts = list(self._of_tree[fid].values())
+        present = [s for s in parts if s.present]
+        tree.status = "present" if present else "withdrawn"
+        used = present or parts
+        placed = []
+        for sighting in used:
+            b = sighting.belief
+            placed.append((b, self.flights[sighting.flight].place.apply(b.x_m, b.y_m, b.z_m)))
+        f = fuse(placed)
+        for name in f.__slots__:
+            setattr(tree, name, getattr(f, name))
+        tree.flights = len({s.flight for s in used})
+        tree.last_ns = now_ns
+        self.changes.trees[fid] = tree
+
+    # -- joining flights
+
+    def _try_align(self, flight: Flight, now_ns: int) -> None:
+        """Lay the flight on the others of its site (a flight without a start point: on any other local site)."""
+        sightings = [s for s in self._of_flight[flight.fid].values() if s.present]
+        if len(sightings) < self._config.align_min_trees:
+            return
+        spots = self._placed(flight, [s.belief for s in sightings])
+        for site in self._sites_to_try(flight):
+            known = [t for t in self.trees.values() if t.site == site and t.status == "present"]
+            if site == flight.site:
+                own = {s.tree for s in sightings}
+                known = [t for t in known if t.fid not in own]
+            if self._tried.get((flight.fid, site)) == (len(sightings), len(known)):
+                continue
+            self._tried[flight.fid, site] = (len(sightings), len(known))
+            prior = None
+            if flight.frame == "global":
+                prior = Prior(_PRIOR_SIGMAS * max(flight.sigma_heading_rad, 0.01) * math.sqrt(2.0),
+                              _PRIOR_SIGMAS * max(flight.sigma_m, 0.1) * math.sqrt(2.0))  # fmt: skip
+            found = align(spots, self._known(known), self._config, prior)
+            if found is not None:
+                self._join(flight, site, found, now_ns)
+                return
+
+    def _sites_to_try(self, flight: Flight) -> list[int]:
+        if flight.frame == "global":
+            return [flight.site]
+        occupied = {f.site for f in self.flights.values() if f.frame == "local" and f.fid != flight.fid}
+        return sorted(occupied - {flight.site})
+
+    def _join(self, flight: Flight, site: int, found: Alignment, now_ns: int) -> None:
+        """Move the flight into the site by what was found, and its trees onto the trees there."""
+        place = flight.place
+        x, y, _ = Rigid2(found.theta_rad, *found.shift_m).apply(place.x_m, place.y_m, 0.0)
+        flight.place = replace(place, theta_rad=place.theta_rad + found.theta_rad, x_m=x, y_m=y)
+        flight.site, flight.aligned = site, True
+        flight.sigma_m, flight.sigma_heading_rad = max(found.rms_m, 0.02), 0.01
+        flight.note = f"laid on the inventory by {found.agreeing} trees, {found.rms_m:.2f} m"
+        self.changes.flights[flight.fid] = flight
+        sightings = list(self._of_flight[flight.fid].values())
+        alone = [s for s in sightings if len(self._of_tree[s.tree]) == 1]
+        self._move_trees(flight, alone)
+        own = {s.tree for s in sightings}
+        others = [t for t in self.trees.values() if t.site == site and t.status != "merged" and t.fid not in own]
+        partner = assign(self._placed(flight, [s.belief for s in alone]), self._known(others), self._config)
+        for sighting, k in zip(alone, partner, strict=True):
+            if k >= 0:
+                self._relink(sighting, others[int(k)].fid)
+        for fid in sorted({s.tree for s in sightings}):
+            self._refresh(fid, now_ns)
+
+    def _move_trees(self, flight: Flight, sightings: list[Sighting]) -> None:
+        for sighting in sightings:
+            tree = self.trees[sighting.tree]
+            tree.site, tree.frame = flight.site, flight.frame
+            self.changes.trees[tree.fid] = tree
+
+    def _relink(self, sighting: Sighting, to: int) -> None:
+        """Make a sighting one of another tree; the tree it leaves stays as merged, so that no number is lost."""
+        left = self.trees[sighting.tree]
+        left.status, left.merged_into = "merged", to
+        self.changes.trees[left.fid] = left
+        if left.visited:
+            self.trees[to].visited = True
+        self.trees[to].first_ns = min(self.trees[to].first_ns, left.first_ns)
+        del self._of_tree[left.fid][sighting.fid]
+        self._of_tree[to][sighting.fid] = sighting
+        sighting.tree = to
+        self.changes.sightings[sighting.fid] = sighting
+
+
+def belief_of(t: Tree) -> Belief:
+    """Return a tree of a list as a belief."""
+    return Belief(t.x_m, t.y_m, t.z_m, t.radius_m, t.radius_height_m, t.height_seen_m, t.sigma_xy_m, t.sigma_radius_m,
+                  t.confidence, t.observations, t.suitable)  # fmt: skip
+
+
+def _moved(a: Belief, b: Belief, by_m: float, radius_m: float) -> bool:
+    return math.hypot(a.x_m - b.x_m, a.y_m - b.y_m) >= by_m or abs(a.radius_m - b.radius_m) >= radius_m

@@ -1,0 +1,110 @@
+"""When two trees are one, and what is believed of a tree that several flights have seen. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from services.inventory.config import InventoryConfig
+from services.inventory.values import Belief
+
+Array = NDArray[np.float64]
+
+_GATE_SIGMAS = 3.0
+_GATE_MAX_M = 0.75
+"""However doubtful two positions are: trees stand farther apart."""
+_SIGMA_FLOOR_M = 0.02
+_RADIUS_FLOOR_M = 0.004
+"""No flight knows a tree better than this: errors of its map are common to all its lists."""
+
+
+@dataclass(frozen=True, slots=True)
+class Spots:
+    """Trees as arrays of one length: positions (N, 2), radii (N,), and their standard deviations, metres."""
+
+    xy_m: Array
+    radius_m: Array
+    sigma_xy_m: Array
+    sigma_radius_m: Array
+
+    @staticmethod
+    def of(rows: Sequence[tuple[float, float, float, float, float]]) -> Spots:
+        """Return the arrays of rows (x, y, radius, sigma_xy, sigma_radius)."""
+        table = np.array(rows, dtype=np.float64).reshape(-1, 5)
+        return Spots(table[:, :2], table[:, 2], table[:, 3], table[:, 4])
+
+    def __len__(self) -> int:
+        return len(self.radius_m)
+
+
+def compatible(a: Spots, b: Spots, config: InventoryConfig) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the distances (N, M) between two sets, and which pairs may be one tree."""
+    distance = np.hypot(a.xy_m[:, None, 0] - b.xy_m[None, :, 0], a.xy_m[:, None, 1] - b.xy_m[None, :, 1])
+    doubt = np.hypot(a.sigma_xy_m[:, None], b.sigma_xy_m[None, :])
+    gate = np.minimum(np.maximum(config.merge_m, _GATE_SIGMAS * doubt), _GATE_MAX_M)
+    radius_doubt = np.hypot(a.sigma_radius_m[:, None], b.sigma_radius_m[None, :])
+    radius_gate = np.maximum(config.merge_radius_m, _GATE_SIGMAS * radius_doubt)
+    alike = np.abs(a.radius_m[:, None] - b.radius_m[None, :]) <= radius_gate
+    return distance, (distance <= gate) & alike
+
+
+def assign(new: Spots, known: Spots, config: InventoryConfig) -> NDArray[np.int64]:
+    """Return for each new tree the known one that it is, or -1. No known tree is given twice: nearest pairs first."""
+    found = np.full(len(new), -1, dtype=np.int64)
+    if not len(new) or not len(known):
+        return found
+    distance, may = compatible(new, known, config)
+    rows, columns = np.nonzero(may)
+    taken: set[int] = set()
+    # distance first, then the indices: equal distances give equal results on every machine
+    for k in np.lexsort((columns, rows, distance[rows, columns])):
+        row, column = int(rows[k]), int(columns[k])
+        if found[row] < 0 and column not in taken:
+            found[row] = column
+            taken.add(column)
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Fused:
+    """What several flights together say of a tree."""
+
+    x_m: float
+    y_m: float
+    z_m: float
+    radius_m: float
+    radius_height_m: float
+    height_seen_m: float
+    sigma_xy_m: float
+    sigma_radius_m: float
+    confidence: float
+    observations: int
+    suitable: bool
+
+
+def fuse(placed: Iterable[tuple[Belief, tuple[float, float, float]]]) -> Fused:
+    """Return the mean weighted by inverse variance: one belief per flight, for a flight's lists are no news to each other.
+
+    ``placed``: each flight's newest belief with its position in the inventory's frame. Suitable is what the weight of
+    the observations says; doubt goes against it.
+    """
+    beliefs = list(placed)
+    weights = [1.0 / max(b.sigma_xy_m, _SIGMA_FLOOR_M) ** 2 for b, _ in beliefs]
+    radius_weights = [1.0 / max(b.sigma_radius_m, _RADIUS_FLOOR_M) ** 2 for b, _ in beliefs]
+    total, radius_total = sum(weights), sum(radius_weights)
+    best = max(range(len(beliefs)), key=lambda i: weights[i])
+    yes = sum(b.observations + 1 for b, _ in beliefs if b.suitable)
+    no = sum(b.observations + 1 for b, _ in beliefs if not b.suitable)
+    x, y, z = (sum(w * p[i] for w, (_, p) in zip(weights, beliefs, strict=True)) / total for i in range(3))
+    return Fused(
+        x_m=x, y_m=y, z_m=z,
+        radius_m=sum(w * b.radius_m for w, (b, _) in zip(radius_weights, beliefs, strict=True)) / radius_total,
+        radius_height_m=beliefs[best][0].radius_height_m, height_seen_m=max(b.height_seen_m for b, _ in beliefs),
+        sigma_xy_m=math.sqrt(1.0 / total), sigma_radius_m=math.sqrt(1.0 / radius_total),
+        confidence=1.0 - math.prod(1.0 - b.confidence for b, _ in beliefs),
+        observations=sum(b.observations for b, _ in beliefs), suitable=yes > no,
+    )  # fmt: skip
