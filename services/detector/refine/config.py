@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict, Field
 
 
@@ -125,6 +127,8 @@ class RefinerConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    frames: Literal["raw", "compressed"] = "raw"
+    """Which of the camera's two keys to take: ``compressed`` where the camera is on another machine."""
     noise: SensorNoise = SensorNoise()
     search: SearchConfig = SearchConfig()
     fit: FitConfig = FitConfig()

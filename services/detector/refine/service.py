@@ -9,7 +9,7 @@ import numpy as np
 from schemas.camera import RgbdFrame
 from schemas.navigation import MissionState
 from schemas.slam import Pose
-from schemas.topics import CAMERA_RGBD, MISSION_STATE, SLAM_POSE, TREES_LIST, TREES_TARGET
+from schemas.topics import CAMERA_COMPRESSED, CAMERA_RGBD, MISSION_STATE, SLAM_POSE, TREES_LIST, TREES_TARGET
 from schemas.trees import Target, Tree, TreeList
 from services.camera.codecs import FrameError, decode_depth
 from services.common.context import Context
@@ -35,7 +35,7 @@ def build(context: Context) -> None:
     warm()
     context.on(TREES_LIST, service.on_trees)
     context.on(MISSION_STATE, service.on_mission)
-    context.on(CAMERA_RGBD, service.on_frame)
+    context.on(CAMERA_COMPRESSED if config.frames == "compressed" else CAMERA_RGBD, service.on_frame)
     context.on(SLAM_POSE, service.on_pose)
     context.every(config.pose_wait_s / 3.0, service.on_tick)
 
