@@ -7,11 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.slam import GraphReason
 from services.common.geometry import inverse, pose
 from services.slam.atlas import Atlas, neighbours
 from services.slam.bundle import Problem, adjust, adjust_large, build, chi_squares
 from services.slam.camera import CameraModel
 from services.slam.config import SlamConfig
+from services.slam.far import FarPrior
 from services.slam.features import Features
 from services.slam.links import create_points, points_of, remove_keyframe, shared_counts
 from services.slam.refine import gate
@@ -45,10 +47,12 @@ class Mapping:
         self.atlas = atlas
         self.camera = camera
         self.config = config
+        self.far = FarPrior(config.far_m, config.far_sigma_inverse_m)
         self.step = crew.step
         self._crew = crew
         self.revision = 0
         """Up by one whenever poses of keyframes were corrected."""
+        self.why: GraphReason = "local_ba"
         self.turns = 0
         """Up by one whenever the whole map was turned: what was computed before is void."""
         self.retired: dict[int, tuple[int, F64]] = {}
@@ -80,6 +84,8 @@ class Mapping:
         self._fuse(k)
         if not self.hurried():
             self.adjust_window(k)
+        with self.step():
+            self.far.learn(atlas.points, atlas.keyframes, self.camera.array[0])
         self._cull_keyframes(k)
 
     def _create(self, k: int) -> None:
@@ -93,7 +99,7 @@ class Mapping:
             self.camera.array,
             config.min_depth_m,
             config.max_depth_m,
-            config.far_m,
+            self.far.distance_m,
             atlas.scales,
         )
         born = np.full(made, atlas.newest_serial, np.int32)
@@ -128,7 +134,7 @@ class Mapping:
             window = np.concatenate([[k], near])
             window = window[self.atlas.keyframes.serial[window] != 0].astype(np.int32)
             part = self._about(window, 2 * self.config.window_keyframes)
-        self._adjust(part, 5, 5)
+        self._adjust(part, 5, 5, "local_ba")
 
     def adjust_all(self, about: int | None = None) -> None:
         """Bundle adjustment of every keyframe but the first, and every point; in a large map of those about ``about``."""
@@ -140,7 +146,7 @@ class Mapping:
                 part = self._about(window, 2 * most)
             else:
                 part = self._part(points_of(self.atlas.points, self.atlas.keyframes, slots), slots[1:], slots[:1])
-        self._adjust(part, 10, 10)
+        self._adjust(part, 10, 10, "full_ba")
 
     def _nearest(self, k: int, most: int) -> I32:
         """Return up to ``most`` keyframes, ``k`` first, then its neighbours, theirs, and so on; not the map's first."""
@@ -172,10 +178,10 @@ class Mapping:
         slots = np.concatenate([free, fixed]).astype(np.int32)
         index = np.full(len(kf.n), -1, np.int32)
         index[slots] = np.arange(len(slots))
-        problem = build(points, kf, ids, slots, index, self.camera.variance, self.camera.far)
+        problem = build(points, kf, ids, slots, index, self.camera.variance, self.far.disparity(self.camera.array[4]))
         return Part(problem, ids, slots, len(free), self.turns)
 
-    def _adjust(self, part: Part | None, robust_iterations: int, iterations: int) -> None:
+    def _adjust(self, part: Part | None, robust_iterations: int, iterations: int, why: GraphReason) -> None:
         """Adjust the copy, apply it, drop the observations that do not fit."""
         if part is None:
             return
@@ -189,6 +195,7 @@ class Mapping:
         with self.step():
             if part.turns == self.turns:
                 self._apply(part)
+                self.why = why
 
     def _apply(self, part: Part) -> None:
         """Take over an adjustment. Its points and keyframes are still there: only mapping ends any."""

@@ -48,7 +48,7 @@ class LiveMaps:
     def __init__(self, config: SlamConfig, folder: Path | None, health: HealthBook) -> None:
         self._config = config
         self._health = health
-        self._crew: Crew = Beside()
+        self.crew: Crew = Beside()
         self._store = None if folder is None else Store(folder, round(config.map_file_mb * 1e6))
         self._keeper: Keeper | None = None
         self._since_ns: int | None = None
@@ -72,7 +72,7 @@ class LiveMaps:
         return slam
 
     def _empty(self, intrinsics: Intrinsics, map_id: str) -> Slam:
-        return Slam(intrinsics, self._config, map_id=map_id, crew=self._crew, keep_trail=False)
+        return Slam(intrinsics, self._config, map_id=map_id, crew=self.crew, keep_trail=False)
 
     def _new(self, intrinsics: Intrinsics, stamp_ns: int) -> Slam:
         slam = self._empty(intrinsics, _name(stamp_ns))
@@ -117,7 +117,7 @@ class LiveMaps:
 
     def end(self) -> None:
         """Stop in order: the map is over."""
-        self._crew.close()
+        self.crew.close()
         if self._keeper is not None:
             self._keeper.end()
 

@@ -61,7 +61,7 @@ class Slam:
         cells = camera.cols * int(np.ceil(intrinsics.height / 20.0))
         self.atlas = Atlas(config.features, cells, config.scale, config.levels)
         self.mapping = Mapping(self.atlas, camera, config, self.crew)
-        self.tracking = Tracking(self.atlas, camera, config)
+        self.tracking = Tracking(self.atlas, camera, config, self.mapping.far)
         self.loops = Loops(self.mapping, self.tracking, Places(vocabulary.load()), config)
         self.reset_counter = 0
         self.graph_version = 0
@@ -79,7 +79,6 @@ class Slam:
         self._revision = 0
         """Of the mapping's corrections, the last one taken over; and of its loops."""
         self._closed = 0
-        self._why: GraphReason = "local_ba"
         self.settled_ms: deque[float] = deque(maxlen=1000)
         """How long mapping took over each keyframe."""
         self.on_made: Callable[[int], None] | None = None
@@ -150,8 +149,8 @@ class Slam:
 
     def _corrected(self) -> GraphUpdate:
         """Return the graph after corrections."""
-        reason: GraphReason = "loop" if self.loops.closed != self._closed else self._why
-        self._revision, self._closed, self._why = self.mapping.revision, self.loops.closed, "local_ba"
+        reason: GraphReason = "loop" if self.loops.closed != self._closed else self.mapping.why
+        self._revision, self._closed = self.mapping.revision, self.loops.closed
         self.graph_version += 1
         return self._graph(reason)
 
@@ -194,7 +193,7 @@ class Slam:
         frame = self.loops.relocate(features)
         if frame is not None:
             if self._taken_up:
-                self._taken_up, self._why = False, "restored"
+                self._taken_up, self.mapping.why = False, "restored"
                 self.mapping.revision += 1
             self._last = None
             self._step = np.eye(4)
@@ -289,7 +288,6 @@ class Slam:
         """Adjust the whole map once, when there is time for it; return the new graph, None when there is none (yet)."""
         if len(self.atlas.slots) < 2:
             return None
-        self._why = "full_ba"
         self.crew.submit(self.mapping.adjust_all)
         return self.catch_up()
 

@@ -7,6 +7,7 @@ written beside its old one and renamed over it.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import struct
@@ -202,8 +203,9 @@ class Store:
 
     def end(self) -> None:
         """Throw the map away: whoever starts next begins anew."""
-        self._log.unlink(missing_ok=True)
-        self._whole.unlink(missing_ok=True)
+        for path in (self._log, self._whole):
+            with contextlib.suppress(OSError):
+                path.unlink()
 
 
 def _header(body: bytes) -> Header | None:

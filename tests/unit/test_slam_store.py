@@ -1,0 +1,192 @@
+"""The map on disk: whatever byte it is cut or damaged at, it is read to the last sound record; a killed slam goes on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from services.common.context import HealthBook
+from services.common.geometry import inverse
+from services.slam import keeper as keeping
+from services.slam.config import SlamConfig
+from services.slam.keeper import Keeper, take_up
+from services.slam.maps import LiveMaps
+from services.slam.slam import Slam
+from services.slam.store import (
+    BEAT,
+    HEADER,
+    KEYFRAME,
+    Arrays,
+    Header,
+    Store,
+    StoredKeyframe,
+    decode_keyframe,
+    encode_keyframe,
+    record,
+    records,
+)
+from tests.unit.slam_room import INTRINSICS, look, turn_on_the_spot
+
+CONFIG = SlamConfig(features=300, disparity_sigma_px=0.15)
+PERIOD_NS = 66_666_667
+MOST = 50_000_000
+
+
+def keyframe(serial: int, features: int = 5) -> StoredKeyframe:
+    rng = np.random.default_rng(serial)
+    n = features
+    columns: Arrays = {
+        "uv": rng.random((n, 2)).astype(np.float32), "octave": np.arange(n, dtype=np.uint8) % 8,
+        "angle": rng.random(n).astype(np.float32), "desc": rng.integers(0, 2**63, (n, 4), dtype=np.uint64),
+        "depth": rng.random(n).astype(np.float32), "info": rng.random(n).astype(np.float32), "far": rng.random(n) > 0.5,
+    }  # fmt: skip
+    return StoredKeyframe(serial, 2, 7 + serial, 10**9 * serial, np.eye(3), np.arange(3.0), columns)
+
+
+def test_a_keyframe_comes_back_as_it_was() -> None:
+    before = keyframe(3)
+    after = decode_keyframe(encode_keyframe(before))
+    assert (after.serial, after.era, after.graph_version, after.age_ns) == (3, 2, 10, 3 * 10**9)
+    np.testing.assert_array_equal(after.t, before.t)
+    for name, column in before.columns.items():
+        np.testing.assert_array_equal(after.columns[name], column)
+
+
+WHOLE = [
+    record(HEADER, b'{"a": 1}'),
+    *(record(KEYFRAME, encode_keyframe(keyframe(k))) for k in range(3)),
+    record(BEAT, b"8" * 8),
+]
+
+
+def test_cut_at_any_byte_the_whole_records_before_are_read() -> None:
+    data, ends = b"".join(WHOLE), np.cumsum([len(r) for r in WHOLE])
+    for cut in range(len(data) + 1):
+        assert len(list(records(data[:cut]))) == int((ends <= cut).sum())
+
+
+@given(st.integers(0, sum(map(len, WHOLE)) - 1), st.binary(min_size=1, max_size=40))
+@settings(max_examples=150, deadline=None)
+def test_damage_costs_only_the_records_it_touches(at: int, junk: bytes) -> None:
+    data, ends = b"".join(WHOLE), np.cumsum([len(r) for r in WHOLE])
+    damaged = data[:at] + junk + data[at + len(junk) :]
+    found = [body for _, body in records(damaged)]
+    touched = {int(np.searchsorted(ends, byte, side="right")) for byte in range(at, min(at + len(junk), len(data)))}
+    sound = [r for i, r in enumerate(WHOLE) if i not in touched]
+    assert all(any(r.endswith(body) for body in found) for r in sound)
+    assert all(any(r.endswith(body) for r in WHOLE) for body in found), "never a record that was not written"
+
+
+def test_the_log_is_bounded_and_tidied(tmp_path: Path) -> None:
+    store = Store(tmp_path, 3000)
+    store.begin(Header("m", "b", "c"))
+    for k in range(20):
+        store.append(KEYFRAME, encode_keyframe(keyframe(k)))
+    filled = store.full
+    assert filled
+    assert (tmp_path / "keyframes.log").stat().st_size <= 3000
+    store.keep_only({2, 3})
+    assert not store.full
+    header, kept, _ = store.read()
+    assert header == Header("m", "b", "c")
+    assert [k.serial for k in kept] == [2, 3]
+
+
+def test_a_damaged_whole_map_is_no_map(tmp_path: Path) -> None:
+    store = Store(tmp_path, MOST)
+    store.begin(Header("m", "b", "c"))
+    store.write_map({"a": np.arange(4)})
+    assert store.read_map()["a"].tolist() == [0, 1, 2, 3]
+    data = bytearray((tmp_path / "map.npz").read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "map.npz").write_bytes(bytes(data))
+    assert store.read_map() == {}
+
+
+def kept_map(folder: Path, frames: int = 16) -> Slam:
+    """Track a turn and keep its map, as a live slam does until it is killed; mapped at once, for the same result."""
+    slam = Slam(INTRINSICS, CONFIG, map_id="map-old")
+    keeper = Keeper(Store(folder, MOST))
+    keeper.begin(slam)
+    for k, T in enumerate(turn_on_the_spot(frames, 70.0)):
+        slam.track(k * PERIOD_NS, *look(T))
+    assert not keeper.fault
+    return slam
+
+
+def taken_up(folder: Path, max_age_s: float = 600.0) -> tuple[Slam, str]:
+    slam = Slam(INTRINSICS, CONFIG)
+    return slam, take_up(Store(folder, MOST), slam, max_age_s)
+
+
+def test_a_killed_slam_goes_on_in_its_map_before_it_gives_a_pose(tmp_path: Path) -> None:
+    old = kept_map(tmp_path)
+    slam, why_not = taken_up(tmp_path)
+    assert not why_not
+    assert slam.map_id == "map-old"
+    dark = slam.track(10**12, np.zeros((240, 320), np.uint8), np.zeros((240, 320), np.float32))
+    assert (dark.status, dark.T_map_camera, dark.graph) == ("relocalising", None, None)
+    poses = turn_on_the_spot(16, 70.0)
+    back = slam.track(10**12 + 1, *look(poses[9]))
+    assert back.status == "tracking"
+    assert back.graph is not None
+    assert back.graph.reason == "restored"
+    assert back.graph_version > old.graph_version
+    assert back.reset_counter != old.reset_counter
+    assert back.T_map_camera is not None
+    true = dict(old.final_trajectory())[9 * PERIOD_NS]
+    assert np.linalg.norm((inverse(true) @ back.T_map_camera)[:3, 3]) < 0.03
+    after = [slam.track(10**12 + 2 + k, *look(T)) for k, T in enumerate(turn_on_the_spot(32, 140.0)[18:])]
+    new = [n.keyframe_id for r in after for n in r.new_keyframes]
+    assert new, "the turn goes on beyond the old map"
+    assert min(new) > max(old.keyframe_poses()), "an old keyframe's number never names a new one"
+
+
+def test_without_the_whole_map_the_keyframes_alone_do(tmp_path: Path) -> None:
+    kept_map(tmp_path)
+    (tmp_path / "map.npz").unlink()
+    slam, why_not = taken_up(tmp_path)
+    assert not why_not
+    assert slam.track(10**12, *look(turn_on_the_spot(16, 70.0)[2])).status == "tracking"
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.83, 0.999])
+def test_a_log_torn_by_the_kill_still_serves(tmp_path: Path, share: float) -> None:
+    kept_map(tmp_path)
+    log = tmp_path / "keyframes.log"
+    data = log.read_bytes()
+    log.write_bytes(data[: int(share * len(data))])
+    slam, why_not = taken_up(tmp_path)
+    assert not why_not
+    assert slam.track(10**12, *look(turn_on_the_spot(16, 70.0)[0])).status == "tracking"
+
+
+def test_an_old_map_another_boots_or_another_cameras_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept_map(tmp_path)
+    now_ns = keeping.since_boot_ns()
+    monkeypatch.setattr(keeping, "since_boot_ns", lambda: now_ns + 601 * 10**9)
+    assert "601 s old" in taken_up(tmp_path)[1]
+    monkeypatch.setattr(keeping, "since_boot_ns", lambda: now_ns)
+    other = Slam(INTRINSICS.model_copy(update={"fx": 300.0}), CONFIG)
+    assert "another camera" in take_up(Store(tmp_path, MOST), other, 600.0)
+    monkeypatch.setattr(keeping, "boot_id", lambda: "tomorrow")
+    assert "last start" in taken_up(tmp_path)[1]
+    assert "no map" in taken_up(tmp_path / "empty")[1]
+
+
+def test_a_disk_that_refuses_is_told_and_slam_goes_on(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    health = HealthBook()
+    maps = LiveMaps(CONFIG, tmp_path / "file" / "slam", health)
+    slam = maps.begin(INTRINSICS, 1)
+    result = slam.track(1, *look(turn_on_the_spot(1, 0.0)[0]))
+    maps.after(slam, result)
+    maps.end()
+    assert result.status == "tracking"
+    assert "new map" in health.notes["map on disk"]

@@ -1,0 +1,160 @@
+"""Mapping beside tracking: turns are kept, faults are told, and the map stays whole."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from services.common.context import HealthBook
+from services.slam.config import SlamConfig
+from services.slam.maps import LiveMaps
+from services.slam.slam import Slam
+from services.slam.worker import Beside
+from tests.unit.slam_room import INTRINSICS, look, turn_on_the_spot
+from tests.unit.test_slam_core import check_bookkeeping, errors
+
+CONFIG = SlamConfig(features=300, disparity_sigma_px=0.15, relocalise_within_s=0.3, new_map_after_s=0.5)
+PERIOD_NS = 66_666_667
+DARK = np.zeros((240, 320), np.uint8), np.zeros((240, 320), np.float32)
+
+
+def settle(crew: Beside) -> None:
+    end_s = time.monotonic() + 30.0
+    while not crew.idle and time.monotonic() < end_s:
+        time.sleep(0.005)
+    assert crew.idle
+
+
+def test_frames_and_steps_never_overlap_and_a_frame_goes_first() -> None:
+    crew = Beside()
+    inside: list[str] = []
+    overlaps: list[list[str]] = []
+    begun = threading.Event()
+
+    def enter(who: str) -> None:
+        inside.append(who)
+        if len(inside) > 1:
+            overlaps.append(list(inside))
+        time.sleep(0.001)
+        inside.remove(who)
+
+    def job() -> None:
+        for _ in range(60):
+            with crew.step():
+                begun.set()
+                with crew.step():  # a step within a step is the same one
+                    enter("step")
+
+    crew.submit(job)
+    assert begun.wait(5.0)
+    waits = []
+    for _ in range(20):
+        asked = time.monotonic()
+        with crew.frame():
+            waits.append(time.monotonic() - asked)
+            enter("frame")
+    settle(crew)
+    crew.close()
+    assert not overlaps
+    assert np.median(waits) < 0.02, "a frame waits for one step, not for the job"
+
+
+def test_a_failed_job_is_raised_by_the_next_frame() -> None:
+    crew = Beside()
+
+    def job() -> None:
+        raise ValueError("on purpose")
+
+    crew.submit(job)
+    with pytest.raises(RuntimeError, match="mapping failed"):  # noqa: PT012 - until the job was reached
+        for _ in range(500):
+            with crew.frame():
+                time.sleep(0.01)
+
+
+def test_a_turn_is_held_and_closed_with_mapping_beside_tracking() -> None:
+    crew = Beside()
+    slam = Slam(INTRINSICS, CONFIG, crew=crew)
+    poses = turn_on_the_spot(80, 380.0)
+    results = []
+    for k, T in enumerate(poses):
+        results.append(slam.track(k * PERIOD_NS, *look(T), np.array([0.0, -9.81, 0.0])))
+        if k % 10 == 9:
+            settle(crew)
+    settle(crew)
+    slam.polish()
+    settle(crew)
+    graph = slam.catch_up()
+    crew.close()
+    assert [r.status for r in results] == ["tracking"] * len(poses)
+    versions = [r.graph_version for r in results]
+    assert versions == sorted(versions)
+    told = [r.graph.version for r in results if r.graph is not None]
+    assert told == sorted(set(told))
+    assert graph is None or graph.reason == "full_ba"
+    check_bookkeeping(slam)
+    metres, rad = errors([T for _, T in slam.final_trajectory()], poses)
+    assert metres < 0.05
+    assert np.degrees(rad) < 1.0
+
+
+def test_lost_for_long_a_new_map_is_begun_and_told(tmp_path: Path) -> None:
+    health = HealthBook()
+    maps = LiveMaps(CONFIG, tmp_path, health)
+    slam = first = maps.begin(INTRINSICS, 0)
+    seen = look(turn_on_the_spot(1, 0.0)[0])
+    images = [seen] * 3 + [DARK] * 10 + [seen]
+    statuses = []
+    for k, image in enumerate(images):
+        result = slam.track(k * PERIOD_NS, *image)
+        statuses.append((slam.map_id, result.status))
+        slam = maps.after(slam, result)
+    maps.end()
+    assert slam is not first
+    lost = [k for k, (map_id, status) in enumerate(statuses) if (map_id, status) == (first.map_id, "lost")]
+    assert len(lost) == 9, "0.5 s at 15 Hz, the first of them the beginning"
+    assert statuses[-1] == (slam.map_id, "tracking")
+    assert first.map_id in health.notes["map"]
+    assert slam.map_id in health.notes["map"]
+    assert health.counters["maps_begun"] == 2
+
+
+def test_a_map_taken_up_in_vain_is_given_up_after_the_stated_time(tmp_path: Path) -> None:
+    maps = LiveMaps(CONFIG, tmp_path, HealthBook())
+    slam = maps.begin(INTRINSICS, 0)
+    slam.track(0, *look(turn_on_the_spot(1, 0.0)[0]))
+    settle_all(maps)
+    health = HealthBook()
+    again = LiveMaps(CONFIG, tmp_path, health)  # the first was killed
+    old = again.begin(INTRINSICS, 10**9)
+    assert old.map_id == slam.map_id
+    assert old.map_id in health.notes["map"]
+    current, statuses = old, []
+    for k in range(8):
+        result = current.track(10**9 + k * PERIOD_NS, *DARK)
+        statuses.append((current.map_id == slam.map_id, result.status))
+        current = again.after(current, result)
+    again.end()
+    maps.end()
+    assert statuses[:6] == [(True, "relocalising")] * 6
+    assert statuses[6:] == [(False, "initialising")] * 2
+    assert "given up" in health.notes["map"]
+
+
+def test_a_stopped_slam_leaves_no_map_behind(tmp_path: Path) -> None:
+    maps = LiveMaps(CONFIG, tmp_path, HealthBook())
+    maps.begin(INTRINSICS, 0).track(0, *look(turn_on_the_spot(1, 0.0)[0]))
+    settle_all(maps)
+    assert list(tmp_path.iterdir())
+    maps.end()
+    assert not list(tmp_path.iterdir())
+
+
+def settle_all(maps: LiveMaps) -> None:
+    crew = maps.crew
+    assert isinstance(crew, Beside)
+    settle(crew)
