@@ -76,7 +76,12 @@ class GeoPackage:
                 self._db.execute("PRAGMA journal_mode = WAL")
                 self._db.execute("PRAGMA synchronous = FULL")
             self._prepare()
+        except InputError:
+            self._db.close()
+            raise
         except (OSError, sqlite3.Error) as error:
+            if hasattr(self, "_db"):
+                self._db.close()
             raise InputError(f"inventory {path}: cannot be opened ({error}); name another with --set station.inventory.database=FILE") from error  # fmt: skip
         self._extents: dict[str, tuple[float, float, float, float]] = {}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, TextIO
 
 from services.common.errors import InputError
 from services.inventory.geopackage import GeoPackage
@@ -59,19 +59,30 @@ class _Locked(GeoPackage):
     """A GeoPackage that no other station writes to meanwhile."""
 
     def __init__(self, path: Path) -> None:
+        self._lock = _locked(path)
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._lock = (path.parent / f".{path.name}.lock").open("w")
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(
-                f"inventory {path}: another station writes to it; name another with --set station.inventory.database=FILE"
-            ) from None
-        except OSError as error:
-            raise InputError(f"inventory {path}: cannot be written: {error.strerror}") from error
-        super().__init__(path)
+            super().__init__(path)
+        except InputError:
+            self._lock.close()
+            raise
 
     def close(self) -> None:
         """Close the file, then let go of the lock."""
         super().close()
         self._lock.close()
+
+
+def _locked(path: Path) -> TextIO:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = (path.parent / f".{path.name}.lock").open("w")
+    except OSError as error:
+        raise InputError(f"inventory {path}: cannot be written: {error.strerror}") from error
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        lock.close()
+        raise InputError(
+            f"inventory {path}: another station writes to it; name another with --set station.inventory.database=FILE"
+        ) from None
+    return lock
