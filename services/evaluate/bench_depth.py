@@ -1,17 +1,24 @@
-"""What each depth filter gains on simulated depth with truth: error, holes, mixed pixels, time."""
+"""What each stage of the depth pipeline gains on simulated depth with truth: error, holes, mixed pixels, time."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.camera import RgbdFrame
+from services.camera.codecs import encode_depth
+from services.camera.conditioning import Conditioner
+from services.camera.config import CameraConfig
 from services.camera.depth.config import DepthConfig
+from services.camera.depth.geometry import register, undistort_depth
 from services.camera.depth.pipeline import DepthPipeline, warm
+from services.evaluate import depth_filters
 from services.evaluate.bench import BenchOptions, BenchReport
+from services.evaluate.depth_views import BentShot, PairShot, Shot, around, at_rest, bent, beside, turning
 
 Image = NDArray[np.float32]
 Grey = NDArray[np.uint8]
@@ -21,16 +28,11 @@ FRAMES = 12
 _MAX_RANGE_M = 6.0
 _EDGE_PX = 7
 _EDGE_STEP_M = 0.3
-_ALL = DepthConfig(drop_mixed=True, bilateral=True, fill_holes=True)
-
-
-@dataclass(frozen=True, slots=True)
-class Shot:
-    """A true and a sensed depth image (H, W) in metres, and the grey image."""
-
-    true: Image
-    sensed: Image
-    grey: Grey
+_OFF = DepthConfig(drop_mixed=False, bilateral=False, fill_holes=False, temporal=False)
+_ALL = _OFF.model_copy(update={"drop_mixed": True, "bilateral": True, "fill_holes": True})
+_WARM_UP = 5
+_TIMED = 3
+"""Times that each view is conditioned for the timing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +41,8 @@ class Row:
 
     name: str
     rmse_m: float
+    """Of all pixels with data; beside an edge, against the nearer of the two surfaces."""
+    inner_rmse_m: float
     """Of pixels away from depth edges."""
     edge_rmse_m: float
     holes: float
@@ -56,46 +60,69 @@ def run(options: BenchOptions) -> BenchReport:
 
     cv2.setNumThreads(1)
     warm()
-    shots = list(_shots(options.seed or 0, 3 if options.quick else FRAMES))
+    seed = options.seed or 0
+    shots = list(around(seed, 3 if options.quick else FRAMES))
     rows = []
     for name, make in methods().items():
         rows.append(measure(name, make, shots))
         options.tell(_line(rows[-1]))
-    still = _still(options.seed or 0)
-    for temporal in (False, True):
-        config = _ALL.model_copy(update={"temporal": temporal})
-        name = "still camera, pipeline" + (" + temporal" if temporal else "")
-        rows.append(measure(name, _pipeline(config), still, warm_up=6))
-        options.tell(_line(rows[-1]))
+    moving = _moving_rows(seed)
+    for row in moving:
+        options.tell(_line(row))
+    geometry = [*undistortion(bent(shots[0])), *registration(beside(seed))]
+    timing = {name: timed(config, shots) for name, config in {"default": DepthConfig(), "all": _every()}.items()}
     by_name = {row.name: row for row in rows}
-    raw, out = by_name["raw"], by_name["pipeline"]
-    figures = {
-        "pipeline_ms_p50": out.ms, "rmse_raw_m": raw.rmse_m, "rmse_out_m": out.rmse_m,
-        "edge_rmse_raw_m": raw.edge_rmse_m, "edge_rmse_out_m": out.edge_rmse_m, "holes_raw": raw.holes,
-        "holes_out": out.holes, "mixed_raw": raw.mixed, "mixed_out": out.mixed,
-    }  # fmt: skip
     conditions = {
         "sensor": "640x480, disparity noise s 0.08 px (40 % of it a fixed pattern), 5 px mixed pixels, shadow holes",
-        "scenes": f"{len(shots)} views of fresh multi, undergrowth and slope scenes", "seed": str(options.seed or 0),
+        "scenes": f"{len(shots)} views of fresh multi, undergrowth and slope scenes", "seed": str(seed),
+        "default": told(DepthConfig()),
     }  # fmt: skip
-    return BenchReport(figures, conditions, _table(rows))
+    return BenchReport(_figures(by_name, timing), conditions, _table(rows, moving, geometry, timing))
 
 
 def methods() -> dict[str, Callable[[], Method]]:
     """Return the methods to compare; each call of a value gives a fresh one."""
-    off = DepthConfig(drop_mixed=False, bilateral=False, fill_holes=False)
+
+    def stages(**on: bool) -> Callable[[], Method]:
+        return _pipeline(_OFF.model_copy(update=on))
+
     return {
-        "raw": _pipeline(off),
-        "box 5x5": lambda: _box,
-        "mean of valid 5x5": lambda: _mean,
-        "Gaussian 5x5": lambda: _gaussian,
-        "median 5x5": lambda: _median,
-        "bilateral": _pipeline(off.model_copy(update={"bilateral": True})),
-        "mixed pixels dropped": _pipeline(off.model_copy(update={"drop_mixed": True})),
-        "holes filled": _pipeline(off.model_copy(update={"fill_holes": True})),
-        "bilateral + mixed dropped": _pipeline(off.model_copy(update={"bilateral": True, "drop_mixed": True})),
-        "pipeline": _pipeline(_ALL),
+        "raw (range only)": _pipeline(_OFF),
+        "box 5x5": lambda: depth_filters.box,
+        "mean of valid 5x5": lambda: depth_filters.mean,
+        "Gaussian 5x5": lambda: depth_filters.gaussian,
+        "median 5x5": lambda: depth_filters.median,
+        "mixed pixels dropped": stages(drop_mixed=True),
+        "bilateral": stages(bilateral=True),
+        "holes filled": stages(fill_holes=True),
+        "mixed dropped + bilateral": stages(drop_mixed=True, bilateral=True),
+        "mixed dropped + bilateral + holes filled": _pipeline(_ALL),
+        "default": _pipeline(DepthConfig()),
     }
+
+
+def told(config: DepthConfig) -> str:
+    """Return the stages that a configuration has on, in words."""
+    names = {
+        "undistort": "undistortion", "drop_mixed": "mixed pixels dropped", "bilateral": "bilateral",
+        "fill_holes": "holes filled", "temporal": "temporal",
+    }  # fmt: skip
+    return ", ".join(["range", *(word for name, word in names.items() if getattr(config, name))])
+
+
+def _every() -> DepthConfig:
+    return _ALL.model_copy(update={"temporal": True})
+
+
+def _moving_rows(seed: int) -> list[Row]:
+    """Measure the temporal filter on a camera at rest, where it should help, and on one that turns."""
+    rows = []
+    for name, shots in (("at rest", at_rest(seed)), ("turning 30 deg/s", turning(seed))):
+        for temporal in (False, True):
+            config = _OFF.model_copy(update={"drop_mixed": True, "temporal": temporal})
+            label = f"{name}: mixed dropped" + (" + temporal" if temporal else "")
+            rows.append(measure(label, _pipeline(config), shots, warm_up=_WARM_UP))
+    return rows
 
 
 def _pipeline(config: DepthConfig) -> Callable[[], Method]:
@@ -104,47 +131,6 @@ def _pipeline(config: DepthConfig) -> Callable[[], Method]:
         return lambda depth, grey: pipeline.process(depth, grey).depth_m
 
     return make
-
-
-def _limited(depth: Image) -> Image:
-    return np.where((depth >= 0.5) & (depth <= _MAX_RANGE_M), depth, np.float32(0.0))
-
-
-def _box(depth: Image, grey: Grey) -> Image:
-    """Plain box filter: holes count as zero metres, as a filter that knows nothing of depth has it."""
-    import cv2
-
-    del grey
-    depth = _limited(depth)
-    return np.where(depth > 0, np.asarray(cv2.blur(depth, (5, 5))), np.float32(0.0))
-
-
-def _mean(depth: Image, grey: Grey) -> Image:
-    """Return the mean of the valid pixels in the window, where at least half of them are valid."""
-    import cv2
-
-    del grey
-    depth = _limited(depth)
-    share = np.asarray(cv2.blur((depth > 0).astype(np.float32), (5, 5)))
-    return np.where(share > 0.5, np.asarray(cv2.blur(depth, (5, 5))) / np.maximum(share, 0.04), np.float32(0.0))
-
-
-def _gaussian(depth: Image, grey: Grey) -> Image:
-    """Gaussian filter of the valid pixels."""
-    import cv2
-
-    del grey
-    depth = _limited(depth)
-    share = np.asarray(cv2.GaussianBlur((depth > 0).astype(np.float32), (5, 5), 1.1))
-    smooth = np.asarray(cv2.GaussianBlur(depth, (5, 5), 1.1))
-    return np.where(share > 0.5, smooth / np.maximum(share, 0.01), np.float32(0.0))
-
-
-def _median(depth: Image, grey: Grey) -> Image:
-    import cv2
-
-    del grey
-    return np.asarray(cv2.medianBlur(_limited(depth), 5), dtype=np.float32)
 
 
 def measure(name: str, make: Callable[[], Method], shots: Sequence[Shot], warm_up: int = 0) -> Row:
@@ -159,10 +145,11 @@ def measure(name: str, make: Callable[[], Method], shots: Sequence[Shot], warm_u
             continue
         times.append((time.perf_counter() - begin) * 1e3)
         sums += _sums(out, shot.true)
-    inner, edge = sums[0] / max(sums[1], 1), sums[2] / max(sums[3], 1)
+    inner, inner_n, edge, edge_n, holes, inside, mixed, wrong = sums
     return Row(
-        name, float(np.sqrt(inner)), float(np.sqrt(edge)), float(sums[4] / sums[5]), float(sums[6] / max(sums[3], 1)),
-        float(sums[7] / max(sums[1] + sums[3], 1)), float(np.median(times)),
+        name, float(np.sqrt((inner + edge) / max(inner_n + edge_n, 1))), float(np.sqrt(inner / max(inner_n, 1))),
+        float(np.sqrt(edge / max(edge_n, 1))), float(holes / inside), float(mixed / max(edge_n, 1)),
+        float(wrong / max(inner_n + edge_n, 1)), float(np.median(times)),
     )  # fmt: skip
 
 
@@ -181,67 +168,117 @@ def _sums(out: Image, true: Image) -> NDArray[np.float64]:
     either = np.minimum(plain, np.minimum(np.square(out - low), np.square(out - high)))
     tolerance = 0.05 + 0.01 * near**2
     between = (out > low + tolerance) & (out < high - tolerance) & (np.abs(out - near) > tolerance)
-    anywhere = (out > 0) & edge
-    inner, outer = data & ~edge, anywhere
+    inner, outer = data & ~edge, (out > 0) & edge
+    error = np.where(edge, either, plain)
     return np.array([
         plain[inner].sum(), inner.sum(), either[outer].sum(), outer.sum(), (inside & (out == 0)).sum(), inside.sum(),
-        (between & outer).sum(), (np.sqrt(either) > 0.1)[inner | outer].sum(),
+        (between & outer).sum(), (np.sqrt(error) > 0.1)[inner | outer].sum(),
     ], dtype=np.float64)  # fmt: skip
 
 
-def _shots(seed: int, count: int) -> Iterator[Shot]:
-    """Yield views all round fresh scenes."""
-    from services.common.geometry import level_camera
+def undistortion(shot: BentShot) -> list[tuple[str, float]]:
+    """Return how far points are from the truth across the line of sight, the lens ignored and corrected (median, m)."""
+    camera = shot.camera
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    plain = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=-1)
+    z = shot.points_m[..., 2]
+    good = np.isfinite(z) & (z > 0.5) & (z < _MAX_RANGE_M)
+    ignored = np.linalg.norm(plain * z[..., None] - shot.points_m[..., :2], axis=-1)[good]
+    # after resampling, pixel (u, v) holds what the bent camera saw of the plain ray; its own true ray tells the rest
+    rays = np.where(good[..., None], shot.points_m[..., :2] / np.maximum(z, 1e-6)[..., None], 0.0).astype(np.float32)
+    moved = [undistort_depth(np.ascontiguousarray(part), camera) for part in (rays[..., 0], rays[..., 1])]
+    depth = undistort_depth(np.where(good, z, 0.0).astype(np.float32), camera)
+    left = np.hypot(moved[0] - plain[..., 0], moved[1] - plain[..., 1]) * depth
+    return [
+        ("lens of freiburg1 ignored: points off by", float(np.median(ignored))),
+        ("undistorted (nearest pixel): points off by", float(np.median(left[depth > 0]))),
+    ]
 
-    kinds = ("multi", "undergrowth", "slope")
-    for k in range(count):
-        kind = kinds[k % len(kinds)]
-        yield from _look(f"random-{kind}-{51_000 + seed}", [level_camera((0.0, 0.0, 1.5), 2.0 * np.pi * k / count)], k)
+
+def registration(shot: PairShot) -> list[tuple[str, float]]:
+    """Return the share of pixels more than 0.3 m off the truth in the colour image, without and with registration."""
+    moved = register(depth_filters.limited(shot.sensed), shot.camera, shot.camera, shot.T_colour_depth)
+
+    def off(depth: Image) -> float:
+        both = (depth > 0) & (shot.true > 0.5) & (shot.true < _MAX_RANGE_M)
+        return float(np.mean(np.abs(depth - shot.true)[both] > _EDGE_STEP_M))
+
+    return [
+        (
+            "depth camera 5.8 cm beside, not registered: share of pixels off > 0.3 m",
+            off(depth_filters.limited(shot.sensed)),
+        ),
+        ("registered: share of pixels off > 0.3 m", off(moved)),
+    ]
 
 
-def _still(seed: int) -> list[Shot]:
-    from services.common.geometry import level_camera
+def timed(config: DepthConfig, shots: Sequence[Shot]) -> dict[str, float]:
+    """Return the median milliseconds of each stage and of the whole (``total``), from frame to frame as in the service."""
+    conditioner = Conditioner(CameraConfig(depth=config))
+    stages: dict[str, list[float]] = {}
+    for number, shot in enumerate([shots[0], *list(shots) * _TIMED]):
+        frame = _frame(shot, number)
+        begin = time.perf_counter()
+        conditioner.apply(frame)
+        total = (time.perf_counter() - begin) * 1e3
+        if number == 0:
+            continue
+        for stage, ms in {**conditioner.stage_ms, "total": total}.items():
+            stages.setdefault(stage, []).append(ms)
+    return {stage: float(np.median(ms)) for stage, ms in stages.items()}
 
-    return list(_look(f"random-multi-{52_000 + seed}", [level_camera((0.0, 0.0, 1.5), 0.0)] * 10, 0))
+
+def _frame(shot: Shot, seq: int) -> RgbdFrame:
+    from services.simulator.render import DEFAULT_INTRINSICS
+
+    colour = np.repeat(shot.grey[:, :, None], 3, axis=2).tobytes()
+    depth = encode_depth(np.rint(shot.sensed * 1000.0).astype(np.uint16), "z16")
+    return RgbdFrame(seq, seq, DEFAULT_INTRINSICS, colour, depth)
 
 
-def _look(scene_name: str, poses: Sequence[NDArray[np.float64]], first: int) -> Iterator[Shot]:
-    import cv2
-
-    from services.simulator.catalogue import scene_by_name
-    from services.simulator.config import SensorConfig
-    from services.simulator.render import DEFAULT_INTRINSICS, Renderer
-    from services.simulator.sensor import RgbdSensor
-    from services.simulator.world import World
-
-    scene = scene_by_name(scene_name)
-    renderer = Renderer(World(scene), DEFAULT_INTRINSICS)
-    sensor = RgbdSensor(SensorConfig(), (480, 640))
-    for k, T in enumerate(poses):
-        lifted = T.copy()
-        lifted[2, 3] += scene.ground.at(0.0, 0.0)
-        rendering = renderer.render(lifted)
-        true = rendering.depth_m.copy()
-        images = sensor.expose(rendering, first + k)
-        grey = np.asarray(cv2.cvtColor(images.colour, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
-        yield Shot(true, images.depth.astype(np.float32) / np.float32(1000.0), grey)
+def _figures(by_name: Mapping[str, Row], timing: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+    raw, out, everything = (
+        by_name["raw (range only)"],
+        by_name["default"],
+        by_name["mixed dropped + bilateral + holes filled"],
+    )
+    figures = {"pipeline_ms_p50": timing["default"]["total"], "all_stages_ms_p50": timing["all"]["total"]}
+    for name, row in (("raw", raw), ("out", out), ("all", everything)):
+        figures |= {
+            f"rmse_{name}_m": row.rmse_m, f"inner_rmse_{name}_m": row.inner_rmse_m, f"edge_rmse_{name}_m": row.edge_rmse_m,
+            f"holes_{name}": row.holes, f"mixed_{name}": row.mixed,
+        }  # fmt: skip
+    return {name: round(value, 5) for name, value in figures.items()}
 
 
 def _line(row: Row) -> str:
     return (
-        f"{row.name}: rmse {1000 * row.rmse_m:.1f} mm, at edges {1000 * row.edge_rmse_m:.0f} mm, "
-        f"holes {100 * row.holes:.2f} %, mixed {100 * row.mixed:.2f} %, {row.ms:.1f} ms"
+        f"{row.name}: rmse {1000 * row.rmse_m:.1f} mm, away from edges {1000 * row.inner_rmse_m:.1f}, at edges "
+        f"{1000 * row.edge_rmse_m:.0f}, holes {100 * row.holes:.2f} %, mixed {100 * row.mixed:.2f} %, {row.ms:.1f} ms"
     )
 
 
-def _table(rows: Sequence[Row]) -> str:
-    lines = [
-        "| method | rmse (mm) | rmse at edges (mm) | holes (%) | mixed pixels (%) | off > 10 cm (%) | ms |",
-        "|---|---|---|---|---|---|---|",
+def _table(
+    rows: Sequence[Row], moving: Sequence[Row], geometry: Sequence[tuple[str, float]],
+    timing: Mapping[str, Mapping[str, float]],
+) -> str:  # fmt: skip
+    head = [
+        "| method | rmse (mm) | away from edges (mm) | at edges (mm) | holes (%) | mixed pixels (%) | off > 10 cm (%) | ms |",
+        "|---|---|---|---|---|---|---|---|",
     ]
-    lines += [
-        f"| {r.name} | {1000 * r.rmse_m:.1f} | {1000 * r.edge_rmse_m:.0f} | {100 * r.holes:.2f} "
-        f"| {100 * r.mixed:.2f} | {100 * r.wrong:.2f} | {r.ms:.1f} |"
-        for r in rows
-    ]
+    lines = [*head, *map(_cells, rows), "", "The temporal filter, camera at rest and turning:", "", *head]
+    lines += [*map(_cells, moving), "", "Geometry:", "", "| what | |", "|---|---|"]
+    for what, value in geometry:
+        lines.append(f"| {what} | {f'{100 * value:.2f} %' if 'share' in what else f'{1000 * value:.1f} mm'} |")
+    lines += ["", "Milliseconds a frame, 640x480, one core, median:", "", "| stages | total | each |", "|---|---|---|"]
+    for name, stages in timing.items():
+        each = ", ".join(f"{stage} {ms:.2f}" for stage, ms in stages.items() if stage != "total")
+        lines.append(f"| {name} | {stages['total']:.1f} | {each} |")
     return "\n".join(lines)
+
+
+def _cells(r: Row) -> str:
+    return (
+        f"| {r.name} | {1000 * r.rmse_m:.1f} | {1000 * r.inner_rmse_m:.1f} | {1000 * r.edge_rmse_m:.0f} "
+        f"| {100 * r.holes:.2f} | {100 * r.mixed:.2f} | {100 * r.wrong:.2f} | {r.ms:.1f} |"
+    )
