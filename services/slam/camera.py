@@ -28,8 +28,6 @@ class CameraModel:
     """(levels,) scale of each octave."""
     variance: F64
     """(levels,) variance of u and v by octave, pixels squared."""
-    far: F64
-    """(2,) disparity and its inverse variance of what lies beyond the sensor's range."""
 
 
 def camera_model(intrinsics: Intrinsics, config: SlamConfig) -> CameraModel:
@@ -40,5 +38,4 @@ def camera_model(intrinsics: Intrinsics, config: SlamConfig) -> CameraModel:
     return CameraModel(
         array=np.array([i.fx, i.fy, i.cx, i.cy, bf]),
         width=float(i.width), height=float(i.height), cols=grid_size(i)[0], scales=scales, variance=scales**2,
-        far=np.array([bf / config.far_m, 1.0 / (bf * config.far_sigma_inverse_m) ** 2]),
     )  # fmt: skip

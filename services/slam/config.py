@@ -27,8 +27,8 @@ class SlamConfig(BaseModel):
     """Depth beyond this makes no map point: the sensor's range."""
     far_m: float = Field(default=12.0, gt=0)
     """Distance at which a feature is begun that has no depth and none around it: beyond the sensor's range."""
-    far_sigma_inverse_m: float = Field(default=0.045, gt=0)
-    """Standard deviation of the inverse of that distance, 1/m."""
+    far_sigma_inverse_m: float = Field(default=0.5, gt=0)
+    """Standard deviation of the inverse of that distance, 1/m. Both are learned anew once parallax has told enough distances."""
     baseline_m: float = Field(default=0.08, gt=0)
     """Virtual stereo baseline: depth enters as the disparity ``fx * baseline / z``, whose noise is constant."""
     disparity_sigma_px: float = Field(default=0.3, gt=0)

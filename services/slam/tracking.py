@@ -12,6 +12,7 @@ from services.slam.atlas import Atlas, neighbours
 from services.slam.binary import match_all
 from services.slam.camera import CameraModel
 from services.slam.config import SlamConfig
+from services.slam.far import FarPrior
 from services.slam.features import Features
 from services.slam.linear import log_so3, matmul3
 from services.slam.links import Keyframes, Points, points_of, shared_counts
@@ -51,10 +52,11 @@ class Tracked:
 class Tracking:
     """Finds poses; reads the map, writes only the points' found and visible counters."""
 
-    def __init__(self, atlas: Atlas, camera: CameraModel, config: SlamConfig) -> None:
+    def __init__(self, atlas: Atlas, camera: CameraModel, config: SlamConfig, far: FarPrior) -> None:
         self.atlas = atlas
         self.camera = camera
         self.config = config
+        self.far = far
 
     def follow(self, last: Tracked, features: Features, R: F64, t: F64) -> Tracked | None:
         """Return the frame located from the last one, started at the predicted ``R``, ``t``; None when that fails."""
@@ -73,7 +75,7 @@ class Tracking:
         known = np.where(last.point >= 0, last.point, -1)
         known[(known >= 0) & (self.atlas.points.n[known] == 0)] = -1
         f, cam = last.features, self.camera.array
-        z = np.where(f.far, self.config.far_m, f.depth)
+        z = np.where(f.far, self.far.distance_m, f.depth)
         local = np.stack([(f.uv[:, 0] - cam[2]) * z / cam[0], (f.uv[:, 1] - cam[3]) * z / cam[1], z], axis=1)
         world = (local - last.t) @ last.R
         has = known >= 0
@@ -82,7 +84,7 @@ class Tracking:
 
     def _doubt_of_last(self, known: I32, features: I32, last: Tracked | None, R: F64, t: F64) -> F64:
         """Return the doubt (M,) of the last frame's ``features``: of map points ``known``, or (-1) temporary ones."""
-        atlas, focal, sigma = self.atlas, self.camera.array[0], self.config.far_sigma_inverse_m
+        atlas, focal, sigma = self.atlas, self.camera.array[0], self.far.sigma_inverse_m
         doubt = far_doubt(atlas.points, atlas.keyframes, known, R, t, focal, sigma)
         if last is not None:
             step_m = moved(R, t, last.R, last.t)[0]
@@ -202,7 +204,7 @@ class Tracking:
         point[match[got]] = ids[got]
         index = np.flatnonzero(point >= 0)
         R, t = frame.R.copy(), frame.t.copy()
-        doubt = far_doubt(p, self.atlas.keyframes, point[index], R, t, cam.array[0], self.config.far_sigma_inverse_m)
+        doubt = far_doubt(p, self.atlas.keyframes, point[index], R, t, cam.array[0], self.far.sigma_inverse_m)
         count, use, H, chi2 = self.refine(f, R, t, p.pos[point[index]], index, doubt)
         if tally:
             p.visible[ids[~np.isnan(place[:, 0])]] += 1
