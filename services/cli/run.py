@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -92,6 +93,17 @@ def with_trees(tree: TreedockConfig) -> TreedockConfig:
     })  # fmt: skip
 
 
+def with_state(tree: TreedockConfig, folder: Path) -> TreedockConfig:
+    """Return ``tree`` with the map kept in an empty ``folder``: it outlives a service that dies, not the run."""
+    shutil.rmtree(folder, ignore_errors=True)
+    update: dict[str, object] = {}
+    if tree.mapper.state_dir == "auto":
+        update["mapper"] = tree.mapper.model_copy(update={"state_dir": str(folder)})
+    if tree.slam.map_folder is None:
+        update["slam"] = tree.slam.model_copy(update={"map_folder": folder / "slam"})
+    return tree.model_copy(update=update)
+
+
 def expected_frames(tree: TreedockConfig) -> int | None:
     """Return how many frames the source will give, None when nobody knows.
 
@@ -171,7 +183,8 @@ class Run:
     def _write_config(self) -> None:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            self._config_file.write_text(self._tree.model_dump_json(indent=1))
+            tree = with_state(self._tree, self._folder / "state")
+            self._config_file.write_text(tree.model_dump_json(indent=1))
         except OSError as error:
             raise InputError(f"--logs {self._folder}: cannot be written: {error.strerror}") from None
 

@@ -16,6 +16,8 @@ from services.common.errors import InputError
 BENCHES: dict[str, str] = {
     "catalogue": "services.evaluate.bench_catalogue",
     "detection": "services.evaluate.bench_detection",
+    "mapper": "services.evaluate.bench_mapper",
+    "peers": "services.evaluate.bench_peers",
     "slam": "services.evaluate.bench_slam",
     "refine": "services.evaluate.bench_refine",
     "latency": "services.evaluate.bench_latency",

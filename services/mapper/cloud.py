@@ -142,7 +142,8 @@ def _voxel_grid(
             ky = np.int64(np.floor(y / voxel)) + 1048576
             kz = np.int64(np.floor(z / voxel))
             key = (kx * np.int64(2097152) + ky) * np.int64(2097152) + kz
-            at = (key * np.int64(-7046029254386353131) >> 20) & mask
+            h = key * np.int64(-7046029254386353131)
+            at = (h ^ (h >> 32)) & mask
             while table[at] >= 0 and keys[table[at]] != key:
                 at = (at + 1) & mask
             i = table[at]

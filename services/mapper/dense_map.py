@@ -43,6 +43,8 @@ class MapSubmap:
     """(N,) the voxel that each point has taken."""
     T_keyed: Matrix = field(default_factory=lambda: np.eye(4))
     """Where the submap stood when it took them."""
+    T_map_anchor: Matrix | None = field(default=None, repr=False)
+    """The anchor's pose that it was last placed by."""
     sent_graph: int = 0
     """Version of the graph under which it was last told of."""
 
@@ -122,14 +124,18 @@ class DenseMap:
             self.size += len(submap.points_m)
 
     def move(self, poses: Mapping[int, Matrix]) -> Moves:
-        """Place submaps by a graph's poses (keyframe id to T_map_camera); return those that moved noticeably."""
+        """Place submaps by a graph's poses (keyframe id to T_map_camera); return those that moved noticeably.
+
+        A pose that is the same object as last time is known not to have changed.
+        """
         moved = []
         for submap in self.submaps.values():
             if submap.anchor_id not in poses:
                 self._anchor_elsewhere(submap, poses)
             T = poses.get(submap.anchor_id)
-            if T is None:
+            if T is None or T is submap.T_map_anchor:
                 continue
+            submap.T_map_anchor = T
             new = T @ submap.T_anchor_submap
             if self._differs(submap.T_map_submap, new):
                 submap.T_map_submap = new
@@ -179,7 +185,7 @@ class DenseMap:
         at = self.submaps[anchor]
         T_map_anchor = at.T_map_submap @ inverse(at.T_anchor_submap)
         submap.T_anchor_submap = inverse(T_map_anchor) @ submap.T_map_submap
-        submap.anchor_id = anchor
+        submap.anchor_id, submap.T_map_anchor = anchor, None
 
     def _differs(self, a: Matrix, b: Matrix) -> bool:
         if float(np.abs(a[:3, 3] - b[:3, 3]).max()) > self._config.move_m:

@@ -85,6 +85,11 @@ class GroundModel:
         """Whether some cells have to be looked at again."""
         return bool(self._dirty)
 
+    @property
+    def covered(self) -> set[CellIndex]:
+        """The cells that hold points of the map, ground or not."""
+        return {(int(a), int(b)) for p in self._prints.values() for a, b in p.cells}
+
     def clear(self) -> None:
         """Begin a new map."""
         self.cells, self._prints, self._dirty = {}, {}, []

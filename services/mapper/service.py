@@ -24,6 +24,7 @@ from services.common.geometry import from_transform, inverse
 from services.mapper.cloud import KeyframeCloud, keyframe_cloud, pixel_rays
 from services.mapper.config import MapperConfig
 from services.mapper.dense_map import DenseMap, MapCloud, MapSubmap
+from services.mapper.ground_model import GroundModel
 from services.mapper.ground_patches import GroundPatches, Occasion
 from services.mapper.keeper import MapKeeper
 from services.mapper.local_submap import LocalSubmap
@@ -72,6 +73,11 @@ class MapperService:
     def cloud(self) -> MapCloud:
         """Return the whole map in the map frame."""
         return self.map.cloud()
+
+    @property
+    def ground(self) -> GroundModel:
+        """The ground per cell, as last looked at."""
+        return self._ground.model
 
     def on_keyframe(self, keyframe: Keyframe) -> None:
         """Take up a keyframe, unless it is known or its images are damaged."""

@@ -22,7 +22,8 @@ _START_SLOTS = 1 << 16
 @njit(cache=True, nogil=True)
 def _slot(key: np.int64, table_keys: Keys) -> int:
     mask = table_keys.shape[0] - 1
-    at = (key * np.int64(-7046029254386353131) >> 20) & mask
+    h = key * np.int64(-7046029254386353131)  # Fibonacci hashing (Knuth, TAOCP 3, 6.4): the upper bits are the mixed ones
+    at = (h ^ (h >> 32)) & mask
     while table_keys[at] != -1 and table_keys[at] != key:
         at = (at + 1) & mask
     return int(at)
