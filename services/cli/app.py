@@ -8,7 +8,7 @@ from __future__ import annotations
 import importlib
 import sys
 from importlib.util import find_spec
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
@@ -39,6 +39,7 @@ def make_app() -> typer.Typer:
         pretty_exceptions_enable=False,
         add_completion=False,
     )
+    app.callback()(_options)
     app.command()(run)
     for name in COMMAND_MODULES:
         if find_spec(f"services.cli.{name}") is not None:
@@ -51,6 +52,23 @@ def make_app() -> typer.Typer:
     for name, about in SERVICES.items():
         app.command(name, help=about, rich_help_panel="Services (each its own process)")(service_command(name))
     return app
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"treedock {version('treedock')}")
+        raise typer.Exit
+
+
+def _options(
+    *,
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version and end.", is_eager=True, callback=_show_version)
+    ] = False,
+) -> None:
+    del version
 
 
 def main() -> None:

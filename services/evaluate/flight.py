@@ -15,11 +15,13 @@ from schemas.slam import Pose
 from schemas.trees import Target, TreeList
 from schemas.vehicle import VehicleState
 from services.common.geometry import Matrix, camera_yaw, pose, wrap_angle
+from services.evaluate.eyes import Round, see
 from services.evaluate.synthetic import ChainErrors, SyntheticChain, TrueTrunk
 from services.navigator.autopilot.bridge import Bridge
 from services.navigator.autopilot.config import AutopilotConfig
 from services.navigator.autopilot.link import Codec
 from services.navigator.config import NavigatorConfig
+from services.navigator.guard import View
 from services.navigator.mission import Mission
 from services.navigator.values import Event, Inputs, Outputs, Seen
 from services.simulator.px4.config import Px4Config, WindConfig
@@ -28,8 +30,31 @@ from services.simulator.px4.simulated import SimulatedPx4
 
 TICK_NS = 10_000_000
 _START_NS = 1_700_000_000_000_000_000
+_VIEW_EVERY = 7
+"""Ticks between two depth images: 14 a second."""
+_CARRY_NS = 300_000_000
 _SERVICES = ("camera", "slam", "mapper", "detector", "refiner", "autopilot")
 _END: frozenset[MissionStateName] = frozenset({"landed", "released", "failed"})
+
+
+@dataclass(frozen=True, slots=True)
+class Walker:
+    """Somebody who walks from one place to another when the aircraft has been on its way to the tree for a while."""
+
+    from_m: tuple[float, float]
+    to_m: tuple[float, float]
+    speed_m_s: float
+    begin_s: float
+    """Seconds after the approach began."""
+    radius_m: float = 0.25
+
+    def at(self, since_s: float) -> Round:
+        """Return where they are, so many seconds after the approach began."""
+        a, b = np.array(self.from_m), np.array(self.to_m)
+        length = float(np.linalg.norm(b - a))
+        share = float(np.clip((since_s - self.begin_s) * self.speed_m_s / max(length, 1e-6), 0.0, 1.0))
+        place = a + share * (b - a)
+        return Round(float(place[0]), float(place[1]), self.radius_m)
 
 
 @dataclass(frozen=True)
@@ -40,6 +65,9 @@ class FlightCase:
     trunks: tuple[TrueTrunk, ...]
     errors: ChainErrors = field(default_factory=ChainErrors)
     wind: WindConfig = field(default_factory=WindConfig)
+    things: tuple[Round, ...] = ()
+    """What stands there and no detector tells: bushes, people."""
+    walkers: tuple[Walker, ...] = ()
     navigator: NavigatorConfig = field(default_factory=NavigatorConfig)
     autopilot: AutopilotConfig = field(default_factory=AutopilotConfig)
 
@@ -74,7 +102,12 @@ class Flight:
         self._link = InProcessLink(self.px4, self.codec)
         T_world_map = pose(np.eye(3), self._camera()[:3, 3])
         self.chain = SyntheticChain(self.case.trunks, T_world_map, self.case.errors, rng)
-        self._T_world_map = T_world_map
+        self._eyes_rng = np.random.default_rng([self.case.seed, 79])
+        self._view: Seen[View] | None = None
+        self._approach_ns = 0
+        self.near_person_m = float("inf")
+        """Least distance of the aircraft's centre to somebody's surface so far."""
+        self._T_world_map_inverse = np.linalg.inv(T_world_map)
         self._pose: Seen[Pose] | None = None
         self._target: Seen[Target] | None = None
         self._trees: Seen[TreeList] | None = None
@@ -126,6 +159,8 @@ class Flight:
         self.chain.observe(self._camera(), self.now_ns)
         for message in self.chain.due(self.now_ns):
             self._deliver(message)
+        if self._ticks % _VIEW_EVERY == 0 and not self.chain.blind:
+            self._look()
         self._run_bridge()
         if self.navigator_alive and self._ticks % 5 == 0:
             self._run_mission()
@@ -154,14 +189,39 @@ class Flight:
 
     def _run_mission(self) -> None:
         services = {name: self.now_ns for name in _SERVICES if name not in self.silent}
-        inputs = Inputs(self.now_ns, self._pose, self._trees, self._target, self._vehicle, services)
+        inputs = Inputs(self.now_ns, self._pose, self._trees, self._target, self._vehicle, services, self._view)
         self.outputs = self.mission.step(inputs)
         self.events.extend(self.outputs.events)
         for event in self.outputs.events:
+            if event.after == "approach" and not self._approach_ns:
+                self._approach_ns = self.now_ns
             if event.after == "docked":
                 self.dock_errors.append(self._docked_truth())
         if self.bridge_alive:
             self.bridge.on_guidance(self.outputs.guidance, self.now_ns)
+
+    def _look(self) -> None:
+        """See what stands around, through the pose that the navigator believes in at this moment."""
+        track = self.mission.board.track
+        last = track.latest
+        if last is None or track.lost or abs(self.now_ns - last.stamp_ns) > _CARRY_NS:
+            return
+        T = track.predict(self.now_ns)
+        true = self._T_world_map_inverse @ self._camera()
+        things = [Round(*self._in_map(t.x_m, t.y_m), t.radius_m) for t in self.case.trunks]
+        things += [Round(*self._in_map(t.x_m, t.y_m), t.radius_m) for t in (*self.people(), *self.case.things)]
+        key = (last.map_id, last.reset_counter)
+        view = see(things, true[:2, 3], camera_yaw(true), T[:3, 3], camera_yaw(T), self.now_ns, key, self._eyes_rng)
+        self._view = Seen(view, self.now_ns)
+
+    def people(self) -> list[Round]:
+        """Return where the walkers are now."""
+        since_s = (self.now_ns - self._approach_ns) / 1e9 if self._approach_ns else -1e9
+        return [w.at(since_s) for w in self.case.walkers]
+
+    def _in_map(self, x_m: float, y_m: float) -> tuple[float, float]:
+        p = self._T_world_map_inverse @ np.array([x_m, y_m, 0.0, 1.0])
+        return float(p[0]), float(p[1])
 
     # -- truth --------------------------------------------------------------------------------------------------
     def _camera(self) -> Matrix:
@@ -172,6 +232,12 @@ class Flight:
         clear = min(
             (float(np.hypot(p[0] - t.x_m, p[1] - t.y_m)) - t.radius_m for t in self.case.trunks), default=np.inf
         )
+        people = min((float(np.hypot(p[0] - t.x_m, p[1] - t.y_m)) - t.radius_m for t in self.people()), default=np.inf)
+        things = min(
+            (float(np.hypot(p[0] - t.x_m, p[1] - t.y_m)) - t.radius_m for t in self.case.things), default=np.inf
+        )
+        self.near_person_m = min(self.near_person_m, people)
+        clear = min(clear, people, things)
         self.clearance_m = min(self.clearance_m, clear)
         touching = clear < self.case.navigator.aircraft_radius_m
         self.touches += int(touching and not self._touching)

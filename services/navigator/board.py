@@ -10,15 +10,17 @@ from schemas.trees import Target, Tree
 from schemas.vehicle import VehicleState
 from services.common.geometry import Matrix, wrap_angle
 from services.navigator.config import NavigatorConfig
-from services.navigator.docking import DockMonitor, DockSample
+from services.navigator.docking import DockMonitor
+from services.navigator.following import Following
 from services.navigator.path import Disc, line_clearance_m
-from services.navigator.selection import SAME_TREE_M, axis_at
+from services.navigator.selection import axis_at
+from services.navigator.surroundings import Surroundings
 from services.navigator.track import Correction, PoseTrack, Sample, Step, TrackLimits
 from services.navigator.trajectory import Fence, Trajectory
 from services.navigator.values import Inputs
 
-_AXIS_TIME_CONSTANT_S = 0.4
-_AXIS_GATE_M = 0.6
+_BARK_MARGIN_M, _TARGET_BARK_M = 0.30, 0.45
+"""Surfaces this near to a listed trunk's bark, or to the target's axis, are the trunk."""
 _SCAN_BINS = 36
 _HIDING_MARGIN_M = 0.10
 _LEAST_FENCE_M = 2.0
@@ -65,10 +67,14 @@ class Board:
     dt_s: float = 0.0
     target_seen_ns: int | None = None
     """When the target was last tracked in the depth image."""
-    _target_stamp_ns: int = -1
-    _list_version: int = -1
-    _off_gate: bool = False
-    """The depth image shows a trunk where the map has none: not our target, whatever its id."""
+    target_since_ns: int = 0
+    """When the target was chosen."""
+    looking: bool = False
+    """Turned away from the target on purpose, to look along the way."""
+    look_since_ns: int = 0
+    """Since when it has faced that way."""
+    around: Surroundings = field(default_factory=Surroundings)
+    following: Following = field(default_factory=Following)
 
     def __post_init__(self) -> None:
         f = self.config.failsafe
@@ -119,7 +125,7 @@ class Board:
             return None
         t = seen.message
         wrong = t.status != "tracking" or t.tree_id != self.target_id or t.map_id != last.map_id
-        return None if wrong or self._off_gate or t.range_m is None or t.bearing_rad is None else t
+        return None if wrong or self.following.off_gate or t.range_m is None or t.bearing_rad is None else t
 
     @property
     def hidden(self) -> bool:
@@ -146,10 +152,27 @@ class Board:
         return min(max(level, self.ground_z_m + self.config.min_ground_m), home_z + self.config.motion.fence_height_m)
 
     def discs(self, keep_out_m: float) -> list[Disc]:
-        """Return the listed trunks but the target, grown by ``keep_out_m``."""
+        """Return what is in the way but the target, grown by ``keep_out_m``: listed trunks, seen things, moving ones."""
         z = self.flight_z_m
         places = [(axis_at(t, z), t) for t in self.trees if t.id != self.target_id]
-        return [Disc(float(p[0]), float(p[1]), t.radius_m + keep_out_m) for p, t in places]
+        mapped = [Disc(float(p[0]), float(p[1]), t.radius_m + keep_out_m) for p, t in places]
+        return mapped + (self.around.discs(keep_out_m, self.now_ns) if self.config.live_guard else [])
+
+    def _look_around(self) -> None:
+        """Take the view into what is known of the space around; trunks are explained by the map."""
+        here, seen = self.here, self.inputs.view
+        if here is None or not self.config.live_guard:
+            return
+        if self.trajectory.fence is not None:
+            self.around.space.visit(here.position_m[:2])
+        if seen is None or seen.message.map_key is None:
+            return
+        z = self.flight_z_m
+        trunks = [(axis_at(t, z), t.radius_m + _BARK_MARGIN_M) for t in self.trees]
+        if self.axis_m is not None:
+            trunks.append((self.axis_m, _TARGET_BARK_M))
+        known = [Disc(float(p[0]), float(p[1]), r) for p, r in trunks]
+        self.around.take(seen.message, (here.map_id, here.reset_counter), known)
 
     @property
     def fence_disc(self) -> Disc | None:
@@ -187,13 +210,15 @@ class Board:
             self._drop_map(before, after)
         if self.here is not None and self.step_kind not in (Step.STALE, Step.LOST):
             self._count_scan(self.here)
-        self._follow_list()
-        self._follow_target()
+        self._look_around()
+        self.following.list_changed(self)
+        self.following.target_seen(self)
 
     def choose(self, tree: Tree) -> None:
         """Make a listed tree the target."""
         self.target_id, self.wanted_id = tree.id, None
-        self._list_version = -1
+        self.following.list_version = -1
+        self.target_since_ns, self.looking = self.now_ns, False
         self.ground_z_m = tree.z_m
         self.axis_m = self.target_seen_ns = None
         self.axis_m = axis_at(tree, self.flight_z_m)
@@ -213,6 +238,7 @@ class Board:
     def drop_target(self) -> None:
         """Have no target any more."""
         self.target_id, self.axis_m, self.dock_direction, self.target_seen_ns = None, None, None, None
+        self.looking = False
         self.dock.clear()
 
     def _correct(self, c: Correction) -> None:
@@ -220,6 +246,7 @@ class Board:
             return c.point(np.array([p[0], p[1], 0.0]))[:2]
 
         self.trajectory.correct(c)
+        self.around.correct(c)
         if self.home_m is not None:
             self.home_m = c.point(self.home_m)
         if self.axis_m is not None:
@@ -245,6 +272,7 @@ class Board:
         self.map_changed = True
         if self.correction is not None:
             return
+        self.around = Surroundings()
         self.done_xy_m = []
         self.home_known = False
         moved = after.position_m - before.position_m
@@ -264,51 +292,3 @@ class Board:
     def scan_gaps(self) -> int:
         """How many of the 10-degree headings no tracked frame has looked along."""
         return _SCAN_BINS - len(self.scan_seen)
-
-    def _follow_list(self) -> None:
-        """Keep to the target when the list changes: under another id, and, until it is seen, at another place."""
-        seen = self.inputs.trees
-        if seen is None or self.axis_m is None or seen.message.version == self._list_version:
-            return
-        self._list_version = seen.message.version
-        z, axis = self.flight_z_m, self.axis_m
-        named = next((t for t in self.trees if t.id == self.target_id), None)
-        if named is None:
-            near = [(float(np.linalg.norm(axis_at(t, z) - axis)), t.id, t) for t in self.trees if t.suitable]
-            distance, _, named = min(near, default=(float("inf"), 0, None))
-            if named is None or distance > SAME_TREE_M:
-                return
-            self.target_id = named.id
-        if self.target_seen_ns is None:
-            self.axis_m, self.ground_z_m = axis_at(named, z), named.z_m
-
-    def _follow_target(self) -> None:
-        self._off_gate = False
-        t, here = self.target, self.here
-        if t is None or here is None:
-            return
-        assert self.inputs.target is not None
-        arrived_ns = self.inputs.target.received_ns
-        if not t.measured:
-            self.target_seen_ns = arrived_ns
-            return
-        if t.range_m is None or t.bearing_rad is None:
-            return
-        seen = self._axis_seen(t, here)
-        self._off_gate = self.axis_m is None or float(np.linalg.norm(seen - self.axis_m)) > _AXIS_GATE_M
-        if self._off_gate or self.axis_m is None or t.stamp_ns <= self._target_stamp_ns:
-            return
-        self.target_seen_ns = arrived_ns
-        dt = min((t.stamp_ns - self._target_stamp_ns) / 1e9, 1.0)
-        self._target_stamp_ns = t.stamp_ns
-        self.axis_m = self.axis_m + dt / (dt + _AXIS_TIME_CONSTANT_S) * (seen - self.axis_m)
-        self.dock.add(DockSample(t.stamp_ns, t.range_m, t.bearing_rad, here.position_m.copy()))
-
-    @staticmethod
-    def _axis_seen(t: Target, here: Sample) -> Matrix:
-        if t.position_map_m is not None:
-            return np.array(t.position_map_m)
-        assert t.range_m is not None
-        assert t.bearing_rad is not None
-        heading = here.yaw_rad + t.bearing_rad
-        return here.position_m[:2] + t.range_m * np.array([np.cos(heading), np.sin(heading)])

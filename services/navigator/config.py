@@ -132,12 +132,16 @@ class NavigatorConfig(BaseModel):
     select_wait_s: float = Field(default=15.0, gt=0.0)
     select_confidence: float = Field(default=0.3, ge=0.0, le=1.0)
     face_wait_s: float = Field(default=10.0, gt=0.0)
+    target_timeout_s: float = Field(default=150.0, gt=0.0)
+    """Longest time from choosing a tree to docking at it; in the approach, then the next tree is chosen."""
+    look_s: float = Field(default=3.0, gt=0.0)
+    """How long to look along a way that nobody has seen, before the tree is given up."""
     undock_m: float = Field(default=1.8, gt=0.0)
     """Distance from the trunk's axis at which undocking ends."""
     aircraft_radius_m: float = Field(default=0.35, gt=0.0)
     safety_radius_m: float = Field(default=0.80, gt=0.0)
     live_guard: bool = True
-    """Brake for whatever the depth image shows in the way, mapped or not."""
+    """Brake for whatever the depth image shows in the way, mapped or not, and fly only where somebody has looked."""
     guard_height_m: float = Field(default=0.25, gt=0.0)
     """Half height of the aircraft with margin, for the live guard."""
     preflight_wait_s: float = Field(default=30.0, gt=0.0)

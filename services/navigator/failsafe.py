@@ -15,8 +15,8 @@ import numpy as np
 from schemas.navigation import MissionStateName
 from services.common.geometry import Matrix
 from services.navigator.board import Board
-from services.navigator.guard import Sweep, free_way_m
 from services.navigator.path import clearance_m
+from services.navigator.routing import moving_into, seen_free_m, way_round
 from services.navigator.track import Step
 
 Response = Literal["release", "hold", "land"]
@@ -29,10 +29,10 @@ _VISUAL: frozenset[MissionStateName] = frozenset({"approach", "dock"})
 _NEEDS_LIST: frozenset[MissionStateName] = frozenset({"scan", "select", "face"})
 _BODY_MARGIN_M = 0.10
 _MOVING_M_S = 0.05
-_VIEW_FRESH_S = 0.5
 _REACTION_S = 0.5
-_TARGET_BARK_M = 0.45
-"""Surfaces this near to the target's axis are the trunk: the largest suitable radius, and the map's error."""
+_GUARDED: frozenset[MissionStateName] = frozenset({"approach", "dock", "undock", "return"})
+_ASK_ROUND_NS, _WAIT_NS = 250_000_000, 1_500_000_000
+"""How often a way round is looked for, and how long what stands in the way is waited for first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +59,10 @@ class Watch:
     ground_seen: bool = False
     blocked_way: Matrix | None = None
     """Direction (2,) in map in which the live guard braked, while it is blocked."""
+    blocked_word: str = ""
+    blocked_ns: int = 0
+    asked_ns: int = 0
+    """When a way round was looked for last."""
     _jumped_ns: int | None = None
     _jump_word: str = ""
     _map_id: str | None = field(default=None)
@@ -67,6 +71,11 @@ class Watch:
         """Forget the last mission."""
         self.mission_id, self.engaged, self.armed = mission_id, False, False
         self.ground_seen, self._jumped_ns, self._map_id, self.blocked_way = False, None, None, None
+
+    def block(self, way: Matrix, word: str, now_ns: int) -> str:
+        """Remember what was braked for, and return it."""
+        self.blocked_way, self.blocked_word, self.blocked_ns, self.asked_ns = way, word, now_ns, now_ns
+        return word
 
     def check(self, board: Board, state: MissionStateName, resume: MissionStateName) -> Fault | None:
         """Return the most pressing fault, or None. ``resume`` is the state a hold interrupts."""
@@ -199,7 +208,7 @@ def _services(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
 
 def _target(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
     del w
-    if doing not in _VISUAL or b.axis_m is None or not b.target_lost:
+    if doing not in _VISUAL or b.axis_m is None or not b.target_lost or b.looking:
         return None
     seen = b.to_axis()
     if doing == "approach" and (b.hidden or (seen is not None and seen[0] > b.config.visual_range_m)):
@@ -216,35 +225,70 @@ def _trees(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
 
 
 def _obstacle(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
-    del doing
     here, velocity = b.here, b.trajectory.velocity_m_s[:2]
     if here is None:
         return None
+    word = _blocked_still(w, b, doing) if w.blocked_way is not None else _blocking(w, b, doing, velocity)
+    return Fault("obstacle", "hold", word, b.config.failsafe.obstacle_hold_s) if word else None
+
+
+def _blocked_still(w: Watch, b: Board, doing: MissionStateName) -> str:
+    """Return why the way that was braked on cannot be gone on, empty when it can, or when there is one round."""
+    assert w.blocked_way is not None
+    if b.now_ns < w.asked_ns + _ASK_ROUND_NS:
+        return w.blocked_word
+    w.asked_ns = b.now_ns
+    waited = b.now_ns - w.blocked_ns >= _WAIT_NS
+    round_it = way_round(b, doing) if waited else False
+    straight = seen_free_m(b, w.blocked_way) >= b.config.safety_radius_m
+    ahead = w.blocked_way * b.config.approach_speed_m_s
+    if round_it or (round_it is None and straight and moving_into(b, ahead) is None):
+        w.blocked_way = None
+        b.planned_ns = -1
+        return ""
+    return w.blocked_word
+
+
+def _blocking(w: Watch, b: Board, doing: MissionStateName, velocity: Matrix) -> str:
+    """Return what stands or comes in the way within the braking distance, empty when nothing does."""
+    assert b.here is not None
     speed = float(np.linalg.norm(velocity))
-    if w.blocked_way is not None and _free_way(b, w.blocked_way) < b.config.safety_radius_m:
-        return Fault("obstacle", "hold", "something stands in the way", b.config.failsafe.obstacle_hold_s)
-    w.blocked_way = None
+    braking = speed * _REACTION_S + speed * speed / b.config.motion.max_accel_m_s2
+    mover = moving_into(b, velocity) if doing in _GUARDED else None
+    if mover is not None:
+        word = f"something moves into the way at {float(np.hypot(*mover.state[2:])):.1f} m/s"
+        return w.block(velocity / speed if speed > _MOVING_M_S else _ahead(b), word, b.now_ns)
     if speed < _MOVING_M_S:
+        return ""
+    if seen_free_m(b, velocity) < b.config.aircraft_radius_m + _BODY_MARGIN_M + braking:
+        return w.block(velocity / speed, "something stands in the way", b.now_ns)
+    here = b.here.position_m[:2]
+    discs = b.discs(b.config.aircraft_radius_m + _BODY_MARGIN_M)
+    now, then = clearance_m(here, discs), clearance_m(here + velocity, discs)
+    return "a trunk stands in the way" if then < 0.0 and then < now else ""
+
+
+def _ahead(b: Board) -> Matrix:
+    assert b.here is not None
+    return np.array([np.cos(b.here.yaw_rad), np.sin(b.here.yaw_rad)])
+
+
+def _unseen(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
+    """Brake before space that nobody has looked into; the states look first, this is behind them."""
+    del w
+    here, velocity = b.here, b.trajectory.velocity_m_s[:2]
+    speed = float(np.linalg.norm(velocity))
+    space = b.around.space
+    if here is None or speed < 2.0 * _MOVING_M_S or doing not in _GUARDED or not (b.config.live_guard and space.fed):
         return None
     braking = speed * _REACTION_S + speed * speed / b.config.motion.max_accel_m_s2
-    if _free_way(b, velocity) < b.config.aircraft_radius_m + _BODY_MARGIN_M + braking:
-        w.blocked_way = velocity / speed
-        return Fault("obstacle", "hold", "something stands in the way", b.config.failsafe.obstacle_hold_s)
-    discs = b.discs(b.config.aircraft_radius_m + _BODY_MARGIN_M)
-    now, then = clearance_m(here.position_m[:2], discs), clearance_m(here.position_m[:2] + velocity, discs)
-    if then >= 0.0 or then >= now:
+    start = here.position_m[:2]
+    if (
+        space.known_ahead_m(start, start + velocity / speed * braking, 0.5 * b.config.aircraft_radius_m)
+        >= braking - 1e-9
+    ):
         return None
-    return Fault("obstacle", "hold", "a trunk stands in the way", b.config.failsafe.obstacle_hold_s)
-
-
-def _free_way(b: Board, way: Matrix) -> float:
-    """Return how far the depth image says the way is free, inf when there is none to say so."""
-    c, here, seen = b.config, b.here, b.inputs.view
-    if not c.live_guard or here is None or seen is None or b.inputs.age_s(seen) > _VIEW_FRESH_S:
-        return float("inf")
-    target = None if b.axis_m is None else b.axis_m - here.position_m[:2]
-    sweep = Sweep(c.aircraft_radius_m + _BODY_MARGIN_M, c.guard_height_m, _TARGET_BARK_M)
-    return free_way_m(seen.message, way, target, sweep)
+    return Fault("unknown space", "hold", "nobody has looked where the way leads", b.config.failsafe.obstacle_hold_s)
 
 
 def _ground_link(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
@@ -257,5 +301,5 @@ def _ground_link(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
 
 _DETECTORS: tuple[Callable[[Watch, Board, MissionStateName], Fault | None], ...] = (
     _operator, _bridge_restarted, _vehicle_link, _battery, _geofence, _slam, _pose_jump, _services, _target, _trees,
-    _obstacle, _ground_link,
+    _obstacle, _unseen, _ground_link,
 )  # fmt: skip

@@ -19,6 +19,7 @@ from services.navigator.config import NavigatorConfig
 from services.navigator.failsafe import AIRBORNE, Fault, Watch
 from services.navigator.preflight import missing
 from services.navigator.states import STATES
+from services.navigator.surroundings import START_COLUMN_M
 from services.navigator.telling import Telling
 from services.navigator.track import Step
 from services.navigator.trajectory import Fence
@@ -288,6 +289,7 @@ class Mission:
         height = m.fence_height_m + _FLOOR_M
         self.board.trajectory.fence = Fence(home.copy(), float(home[2]) - _FLOOR_M, m.fence_radius_m, height)
         self.board.trajectory.reset(here.position_m, here.yaw_rad)
+        self.board.around.space.visit(here.position_m[:2], START_COLUMN_M)
 
     def _landing(self, now_ns: int) -> Intent:
         v = self.board.vehicle

@@ -5,12 +5,16 @@ from __future__ import annotations
 from services.navigator.board import Board
 from services.navigator.config import NavigatorConfig
 
+_VIEW_FRESH_S = 2.0
+
 
 def missing(board: Board, config: NavigatorConfig) -> list[str]:
     """Return what is not well, in words for the operator; empty when the aircraft may take off."""
     faults = [] if board.here is not None else ["slam gives no pose"]
     if config.handheld:
         return faults
+    if config.live_guard and board.inputs.age_s(board.inputs.view) > _VIEW_FRESH_S:
+        faults.append("the live guard sees no depth images (navigator.live_guard=false flies without it)")
     v = board.vehicle
     if v is None:
         return [*faults, "no word from the autopilot"]

@@ -39,8 +39,10 @@ LOG = logging.getLogger(__name__)
 WATCHED = ("camera", "slam", "mapper", "detector", "refiner", "autopilot", "station")
 """Services whose health the failsafes look at."""
 _STATE_EVERY = 4
-_GUARDED = frozenset({"approach", "dock", "return", "hold"})
-"""States with a way ahead that the camera looks along."""
+_UNGUARDED = frozenset({"idle", "landed", "failed", "released"})
+"""States in which nothing is flown: the eyes are closed."""
+_CARRY_NS = 300_000_000
+"""A pose older than this is not carried on to a frame's stamp: the view is good for the sweep only."""
 
 
 class Navigator:
@@ -102,13 +104,17 @@ class Navigator:
 
     def _on_frame(self, frame: RgbdFrame) -> None:
         """Look at the depth while there is a way to guard; frames of other encodings are not for us."""
-        here = self.mission.board.track.latest
-        if self.mission.state not in _GUARDED or here is None or frame.depth_encoding != "z16":
+        track = self.mission.board.track
+        here = track.latest
+        if self.mission.state in _UNGUARDED or here is None or frame.depth_encoding != "z16":
             return
         size = (frame.intrinsics.height, frame.intrinsics.width)
         with self._context.health.timed("guard"):
             depth = np.frombuffer(frame.depth, dtype="<u2").reshape(size)
-            view = look(depth, frame.intrinsics, here.T_map_camera[:3, :3], frame.stamp_ns)
+            young = not track.lost and abs(frame.stamp_ns - here.stamp_ns) <= _CARRY_NS
+            T = track.predict(frame.stamp_ns) if young else here.T_map_camera
+            key = (here.map_id, here.reset_counter) if young else None
+            view = look(depth, frame.intrinsics, T, frame.stamp_ns, key)
         self._view = Seen(view, self._context.clock.now_ns())
 
     def _on_trees(self, trees: TreeList) -> None:

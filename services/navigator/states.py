@@ -12,8 +12,16 @@ import numpy as np
 
 from schemas.navigation import MissionStateName
 from services.common.geometry import Matrix, wrap_angle
+from services.navigator.approaching import (
+    FACING_RAD,
+    TURN_FIRST_RAD,
+    approach,
+    at_height,
+    give_up,
+    yaw_to_axis,
+)
 from services.navigator.board import Board
-from services.navigator.path import clearance_m, plan, standoff
+from services.navigator.routing import route
 from services.navigator.selection import choose
 from services.navigator.trajectory import Aim
 from services.navigator.values import Intent, Next
@@ -22,16 +30,9 @@ Result = Intent | Next
 
 _HEIGHT_TOLERANCE_M = 0.12
 _STILL_M_S = 0.15
-_FACING_RAD = float(np.radians(5.0))
-_TURN_FIRST_RAD = float(np.radians(8.0))
-"""Guidance says turn rather than toward beyond this heading error."""
 _CENTRED_RAD = float(np.radians(2.0))
-_CORNER_M = 0.25
 _GAP_M = 0.025
 """Guidance says stop within this distance of the aim."""
-_REPLAN_S = 1.0
-_YAW_LEAD_NS = 300_000_000
-"""The aircraft's yaw follows its setpoint by about this much later."""
 _YAW_INTEGRAL_SHARE = 0.4
 _SETTLED_M_S = 0.06
 """Standing offsets are learnt below this speed of the setpoint: while it moves, the aircraft's lag is no offset."""
@@ -99,7 +100,7 @@ def face(b: Board, since_s: float) -> Result:
         return Intent("stop", "freeze")
     distance, bearing = seen
     still = abs(b.trajectory.yaw_rate_rad_s) < np.radians(2.0)
-    if abs(bearing) < _FACING_RAD and still:
+    if abs(bearing) < FACING_RAD and still:
         if not b.target_lost:
             return Next("approach", f"tree {b.target_id} in sight, {distance:.2f} m ahead")
         if b.hidden:
@@ -107,42 +108,9 @@ def face(b: Board, since_s: float) -> Result:
         if distance > c.visual_range_m:
             return Next("approach", f"tree {b.target_id} is {distance:.2f} m ahead by the map: nearer to see it")
     if since_s > c.face_wait_s + np.pi / c.turn_rate_rad_s:
-        name = b.target_id
-        b.finish_target(visited=False)
-        b.drop_target()
-        return Next("select", f"tree {name} is not seen where the map has it")
-    aim = Aim(_cruise(b), _yaw_to_axis(b), 0.3, c.turn_rate_rad_s)
+        return give_up(b, f"tree {b.target_id} is not seen where the map has it")
+    aim = Aim(_cruise(b), yaw_to_axis(b), 0.3, c.turn_rate_rad_s)
     return Intent("turn_left" if bearing > 0.0 else "turn_right", "aim", aim, abs(bearing), "rad")
-
-
-def approach(b: Board, since_s: float) -> Result:
-    """Entry: the target is ahead. Exit: near enough -> dock; no way to it -> select."""
-    del since_s
-    c, here, seen = b.config, b.here, b.to_axis()
-    if b.axis_m is None:
-        return Next("select", "the target is gone from the map")
-    if here is None or seen is None:
-        return Intent("stop", "freeze")
-    distance, bearing = seen
-    goal_xy = _docking_place(b, here.position_m[:2])
-    way = None if goal_xy is None else _way(b, b.trajectory.position_m[:2], goal_xy)
-    if goal_xy is None or way is None:
-        name = b.target_id
-        b.finish_target(visited=False)
-        b.drop_target()
-        return Next("select", f"no clear way to tree {name}")
-    last_leg = len(way) == 1
-    if last_leg and distance <= c.dock.enter_m and abs(bearing) < 2.0 * _FACING_RAD:
-        b.dock.clear()
-        b.dock_direction = (goal_xy - b.axis_m) / float(np.linalg.norm(goal_xy - b.axis_m))
-        b.dock_offset_m = b.dock_yaw_rad = 0.0
-        return Next("dock", f"{distance:.2f} m from tree {b.target_id}")
-    to_go = float(np.linalg.norm(way[0] - here.position_m[:2]))
-    aim = Aim(_at(b, way[0]), _yaw_to_axis(b), c.approach_speed_m_s, c.turn_rate_rad_s, c.approach_gain_per_s)
-    if abs(bearing) > _TURN_FIRST_RAD and last_leg:
-        aim = Aim(_at(b, b.trajectory.position_m[:2]), _yaw_to_axis(b), 0.1, c.turn_rate_rad_s)
-        return Intent("turn_left" if bearing > 0.0 else "turn_right", "aim", aim, abs(bearing), "rad")
-    return Intent("toward", "aim", aim, to_go, "m")
 
 
 def dock(b: Board, since_s: float) -> Result:
@@ -164,7 +132,7 @@ def dock(b: Board, since_s: float) -> Result:
         b.finish_target(visited=False)
         return Next("undock", f"could not settle at tree {name}: {verdict.reason}")
     aim, gap = _station(b, distance, bearing), distance - c.dock.aim_m
-    if abs(bearing) > (_CENTRED_RAD if abs(gap) < _GAP_M else _TURN_FIRST_RAD):
+    if abs(bearing) > (_CENTRED_RAD if abs(gap) < _GAP_M else TURN_FIRST_RAD):
         return Intent("turn_left" if bearing > 0.0 else "turn_right", "aim", aim, abs(bearing), "rad")
     if abs(gap) < _GAP_M:
         return Intent("stop", "aim", aim)
@@ -196,7 +164,7 @@ def undock(b: Board, since_s: float) -> Result:
         if b.docked_count >= b.trees_wanted:
             return _go_home(b, "clear of the trunk")
         return Next("select", "clear of the trunk")
-    goal = _at(b, b.axis_m + b.dock_direction * c.undock_m)
+    goal = at_height(b, b.axis_m + b.dock_direction * c.undock_m)
     return Intent("backward", "aim", Aim(goal, b.trajectory.yaw_rad, 0.3, 0.0), max(left, 0.0), "m")
 
 
@@ -210,16 +178,16 @@ def return_home(b: Board, since_s: float) -> Result:
     left = float(np.linalg.norm(here.position_m[:2] - b.home_m[:2]))
     if left < 0.2:
         return Next("landing", f"back at the start within {left:.2f} m")
-    way = _way(b, b.trajectory.position_m[:2], b.home_m[:2])
+    way = route(b, b.trajectory.position_m[:2], b.home_m[:2])
     if way is None or since_s > 120.0:
         return Next("landing", f"no way back: landing {left:.1f} m from the start")
     ahead = way[0] - here.position_m[:2]
     yaw = b.trajectory.unwrapped(float(np.arctan2(ahead[1], ahead[0]))) if left > 0.7 else b.trajectory.yaw_rad
     turn = wrap_angle(yaw - here.yaw_rad)
     if abs(turn) > np.radians(30.0):
-        aim = Aim(_at(b, b.trajectory.position_m[:2]), yaw, 0.1, b.config.turn_rate_rad_s)
+        aim = Aim(at_height(b, b.trajectory.position_m[:2]), yaw, 0.1, b.config.turn_rate_rad_s)
         return Intent("turn_left" if turn > 0.0 else "turn_right", "aim", aim, abs(turn), "rad")
-    aim = Aim(_at(b, way[0]), yaw, b.config.motion.max_speed_m_s, b.config.turn_rate_rad_s)
+    aim = Aim(at_height(b, way[0]), yaw, b.config.motion.max_speed_m_s, b.config.turn_rate_rad_s)
     return Intent("toward", "aim", aim, left, "m")
 
 
@@ -239,42 +207,9 @@ def _go_home(b: Board, reason: str) -> Next:
     return Next("landing", reason)
 
 
-def _at(b: Board, xy: Matrix) -> Matrix:
-    return np.array([xy[0], xy[1], b.flight_z_m])
-
-
 def _cruise(b: Board) -> Matrix:
     """Return the place to hover at: where the setpoint is, at flight height."""
-    return _at(b, b.trajectory.position_m[:2])
-
-
-def _yaw_to_axis(b: Board) -> float:
-    """Return the setpoint yaw (unwrapped) that looks at the axis from where the camera will be when it is reached."""
-    assert b.axis_m is not None
-    assert b.here is not None
-    offset = b.axis_m - b.track.predict(b.now_ns + _YAW_LEAD_NS)[:2, 3]
-    return b.trajectory.unwrapped(float(np.arctan2(offset[1], offset[0])))
-
-
-def _docking_place(b: Board, from_m: Matrix) -> Matrix | None:
-    """Return x, y of the place in front of the target that keeps clear of the other trunks, inside the fence, or None."""
-    assert b.axis_m is not None
-    place = standoff(b.axis_m, from_m, b.config.dock.aim_m, b.discs(b.config.safety_radius_m))
-    body, fence = b.discs(b.config.aircraft_radius_m + 0.1), b.fence_disc
-    outside = fence is not None and clearance_m(place, [fence]) > 0.0
-    return place if not outside and clearance_m(place, body) >= 0.0 else None
-
-
-def _way(b: Board, start: Matrix, goal: Matrix) -> list[Matrix] | None:
-    """Return the corners to ``goal``, planned anew once a second or when the map moved."""
-    while b.corners and float(np.linalg.norm(b.corners[0] - start)) < _CORNER_M:
-        b.corners = b.corners[1:]
-    if b.planned_ns < 0 or (b.now_ns - b.planned_ns) / 1e9 > _REPLAN_S:
-        corners = plan(start, goal, b.discs(b.config.safety_radius_m), b.fence_disc)
-        if corners is None:
-            return None
-        b.corners, b.planned_ns = corners[:-1], b.now_ns
-    return [*b.corners, goal]
+    return at_height(b, b.trajectory.position_m[:2])
 
 
 def _station(b: Board, distance_m: float, bearing_rad: float) -> Aim:
@@ -290,4 +225,4 @@ def _station(b: Board, distance_m: float, bearing_rad: float) -> Aim:
         turned = b.dock_yaw_rad + _YAW_INTEGRAL_SHARE * gain * bearing_rad
         b.dock_yaw_rad = float(np.clip(turned, -_YAW_CORRECTION_RAD, _YAW_CORRECTION_RAD))
     place = b.axis_m + b.dock_direction * (c.dock.aim_m + b.dock_offset_m)
-    return Aim(_at(b, place), _yaw_to_axis(b) + b.dock_yaw_rad, 0.2, c.turn_rate_rad_s, c.approach_gain_per_s)
+    return Aim(at_height(b, place), yaw_to_axis(b) + b.dock_yaw_rad, 0.2, c.turn_rate_rad_s, c.approach_gain_per_s)

@@ -11,6 +11,7 @@ from schemas.slam import Pose, SlamStatus
 from schemas.trees import Target, Tree, TreeList
 from schemas.vehicle import VehicleState
 from services.common.geometry import Matrix, level_camera, rotation_z, to_transform, wrap_angle
+from services.evaluate.eyes import Round, see
 from services.navigator.config import NavigatorConfig
 from services.navigator.guard import View
 from services.navigator.mission import Mission
@@ -60,8 +61,13 @@ class World:
     station: bool = False
     revision: int = 0
     """Of the list of trees: raise it after changing them."""
-    walker: Matrix | None = None
-    """Somebody (x, y) whom the camera sees and the map does not know."""
+    walkers: list[Matrix] = field(default_factory=list)
+    """People (x, y) whom the camera sees and the map does not know."""
+    walker_velocity_m_s: Matrix = field(default_factory=lambda: np.zeros(2))
+    eyes: bool = True
+    """Whether the live guard sees anything."""
+    least_m: float = float("inf")
+    """Least distance to a walker's middle so far."""
     events: list[Event] = field(default_factory=list)
     outputs: Outputs | None = None
     armings: int = 0
@@ -91,6 +97,8 @@ class World:
     def step(self) -> Outputs:
         self.now_ns += round(STEP_S * 1e9)
         self._steps += 1
+        self.walkers = [w + STEP_S * self.walker_velocity_m_s for w in self.walkers]
+        self.least_m = min([self.least_m, *(float(np.hypot(*(w - self.position_m[:2]))) for w in self.walkers)])
         self._sense()
         inputs = Inputs(
             self.now_ns, self._pose, self._trees, self._target, self._vehicle, dict(self._seen_ns), self._view()
@@ -130,13 +138,12 @@ class World:
             self._vehicle = Seen(self._vehicle_message(), self.now_ns)
 
     def _view(self) -> Seen[View]:
-        points = np.zeros((0, 3))
-        if self.walker is not None:
-            offset = self.walker - self.position_m[:2]
-            spread = np.linspace(-0.2, 0.2, 20)
-            points = np.stack([offset[0] + spread, offset[1] + spread[::-1], 0.0 * spread], axis=1)
-            points = points @ rotation_z(self.shift_yaw_rad).T
-        return Seen(View(self.now_ns, points), self.now_ns)
+        things = [Round(t.x_m, t.y_m, t.radius_m) for t in self.trees]
+        things += [Round(float(w[0]), float(w[1]), 0.25) for w in self.walkers]
+        things = things if self.eyes else []
+        place, yaw = self.believed(self.position_m), wrap_angle(self.yaw_rad + self.shift_yaw_rad)
+        key = (self.map_id, self.reset_counter)
+        return Seen(see(things, self.position_m[:2], self.yaw_rad, place, yaw, self.now_ns, key), self.now_ns)
 
     def _pose_message(self, status: SlamStatus) -> Pose:
         T = level_camera(self.believed(self.position_m), wrap_angle(self.yaw_rad + self.shift_yaw_rad))

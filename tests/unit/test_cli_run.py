@@ -91,3 +91,10 @@ def test_a_port_lost_to_another_process_is_chosen_anew(tmp_path: Path, monkeypat
     assert made.to_the_end() == 0
     assert tried == [7001, 7002, 7003]
     assert '"port": 7003' in (tmp_path / "config.json").read_text()
+
+
+def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    from services.cli.app import invoke
+
+    assert invoke(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("treedock ")

@@ -268,6 +268,7 @@ def test_outside_the_geofence_lands() -> None:
 
 def test_a_trunk_in_the_way_brakes() -> None:
     world = _flying("approach")
+    world.eyes = False  # only the map knows
     here, velocity = world.position_m[:2], _setpoint(world)[1][:2]
     assert np.linalg.norm(velocity) > 0.05
     ahead = here + velocity / np.linalg.norm(velocity) * 0.75

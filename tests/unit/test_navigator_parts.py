@@ -7,17 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from schemas.camera import Intrinsics
 from schemas.slam import Pose
 from services.common.geometry import camera_yaw, exp_rotation, level_camera, to_transform
 from services.navigator.config import DockConfig, MotionConfig, NavigatorConfig
 from services.navigator.docking import DockMonitor, DockSample
-from services.navigator.guard import Sweep, free_way_m, look
 from services.navigator.path import Disc, clearance_m, line_clearance_m, plan, standoff
 from services.navigator.selection import axis_at, choose
 from services.navigator.track import Correction, PoseTrack, Step, correction_between
 from services.navigator.trajectory import Aim, Fence, Trajectory
-from tests.unit.navigator_world import World, tree
+from tests.unit.navigator_world import tree
 
 DT = 0.05
 coordinate = st.floats(-8.0, 8.0)
@@ -257,71 +255,3 @@ def test_configuration_that_contradicts_itself_is_refused() -> None:
         DockConfig(aim_m=1.2)
     with pytest.raises(ValueError, match="Extra inputs"):
         NavigatorConfig(aim=1.0)  # type: ignore[call-arg]
-
-
-# -- live guard ---------------------------------------------------------------------------------------------------
-
-INTRINSICS = Intrinsics(width=640, height=480, fx=500.0, fy=500.0, cx=319.5, cy=239.5)
-SWEEP = Sweep(0.45, 0.25, 0.45)
-
-
-def _scene(*pillars: tuple[float, float, float]) -> np.ndarray:
-    """Depth (mm) of upright pillars: forward m, left m, radius m, on nothing."""
-    depth = np.zeros((480, 640), dtype=np.uint16)
-    u = np.arange(640)
-    for forward, left, radius in sorted(pillars, reverse=True):
-        across = -(u - 319.5) / 500.0 * forward
-        depth[:, np.abs(across - left) < radius] = round(1000 * forward)
-    return depth
-
-
-def _free(depth: np.ndarray, yaw: float = 0.0, target: tuple[float, float] | None = None) -> float:
-    T = level_camera((1.0, 2.0, 3.0), yaw)
-    view = look(depth, INTRINSICS, T[:3, :3], 0)
-    direction = np.array([np.cos(yaw), np.sin(yaw)])
-    return free_way_m(view, direction, None if target is None else np.array(target), SWEEP)
-
-
-def test_the_guard_sees_what_stands_in_the_box_and_nothing_else() -> None:
-    assert _free(_scene()) == float("inf")
-    assert _free(_scene((2.0, 0.0, 0.1))) == pytest.approx(2.0)
-    assert _free(_scene((2.0, 0.4, 0.1)), yaw=0.7) == pytest.approx(2.0)
-    assert _free(_scene((2.0, 0.7, 0.1))) == float("inf")
-    assert _free(_scene((2.0, 0.0, 0.1)), target=(2.1, 0.0)) == float("inf")
-    assert _free(_scene((2.0, 0.0, 0.1), (1.2, 0.1, 0.05)), target=(2.1, 0.0)) == pytest.approx(1.2)
-
-
-def test_noise_on_a_few_pixels_is_no_obstacle() -> None:
-    depth = _scene()
-    depth[228:252, 308:332] = 900  # nine rays of the thinned image
-    assert _free(depth) == pytest.approx(0.9)
-    depth[:] = 0
-    depth[228:236, 308:332] = 900  # three
-    assert _free(depth) == float("inf")
-
-
-def test_a_person_in_the_way_brakes_waits_and_goes_on() -> None:
-    world = World()
-    world.start()
-    world.run("approach")
-    world.run(seconds=2.0)
-    place = world.position_m[:2] + 1.0 * world.mission.board.trajectory.velocity_m_s[:2] / 0.35
-    world.walker = place
-    world.run("hold", 3.0)
-    assert world.state == "hold"
-    assert "in the way" in world.mission.reason
-    world.run(seconds=4.0)
-    assert world.state == "hold"
-    assert np.linalg.norm(world.position_m[:2] - place) > 0.45
-    world.walker = None
-    assert world.run("docked") == "docked"
-
-
-def test_an_obstacle_that_stays_ends_in_a_landing() -> None:
-    world = World()
-    world.start()
-    world.run("approach")
-    world.run(seconds=2.0)
-    world.walker = world.position_m[:2] + 1.0 * world.mission.board.trajectory.velocity_m_s[:2] / 0.35
-    assert world.run("landing", 40.0) == "landing"
-    assert np.linalg.norm(world.position_m[:2] - world.walker) > 0.45

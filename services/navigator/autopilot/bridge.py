@@ -16,8 +16,10 @@ from schemas.slam import Pose
 from schemas.vehicle import VehicleState
 from services.common.geometry import Matrix, wrap_angle
 from services.navigator.autopilot import px4
+from services.navigator.autopilot.clock_check import ClockCheck
 from services.navigator.autopilot.config import AutopilotConfig
 from services.navigator.autopilot.engagement import Engagement, Order, Vehicle
+from services.navigator.autopilot.foreign import Foreign
 from services.navigator.autopilot.frames import Mount, to_ned
 from services.navigator.autopilot.parameters import ParameterReader, refusals
 from services.navigator.autopilot.telemetry import Telemetry
@@ -27,6 +29,7 @@ from services.navigator.track import Correction, Step
 _HEARTBEAT_NS = 1_000_000_000
 _ASK_AGAIN_NS = 2_000_000_000
 _AGREE_NS = 50_000_000
+_ORIGINS = 30
 _AHEAD_S = 0.15
 """A setpoint is carried on along its velocity for at most this long after its guidance was made."""
 _USE_POSITION_VELOCITY_YAW_RATE = 448
@@ -42,7 +45,10 @@ class Bridge:
         self.telemetry = Telemetry()
         self.vision = Vision(config, self.mount)
         self.engagement = Engagement(config)
-        self.parameters = ParameterReader(config.vehicle)
+        self.parameters = ParameterReader(config.vehicle, change=config.set_parameters)
+        self.clocks = ClockCheck()
+        self.foreign = Foreign(config.component_id)
+        self._origins_sent = 0
         self.setpoints_sent = 0
         self.setpoints_refused = 0
         self._far = ""
@@ -70,16 +76,26 @@ class Bridge:
         elif step in (Step.RELOCATED, Step.JUMP):
             self._corrections.clear()
             self._moved_ns, self._held, self._sent = now_ns, None, None
+        if step in (Step.CORRECTION, Step.RELOCATED, Step.JUMP):
+            self.foreign.moved()
 
     def on_guidance(self, guidance: Guidance, now_ns: int) -> None:
         """Take the navigator's guidance."""
         self.engagement.on_guidance(guidance, self.vehicle(now_ns), now_ns)
 
     def handle(self, message: Any, received_ns: int) -> None:  # noqa: ANN401 - pymavlink's classes share no typed base
-        """Take a message of the autopilot. What others say on the link is not heard."""
-        if self.telemetry.take(message, received_ns) and message.get_type() == "PARAM_VALUE":
+        """Take a message of the autopilot. Of what others say on the link it is only noted that they are there."""
+        if not self.telemetry.take(message, received_ns):
+            self.foreign.hear(message, self.telemetry.system, received_ns)
+            return
+        kind = message.get_type()
+        if kind == "PARAM_VALUE":
             self.parameters.take(message.param_id, message.param_value, message.param_type)
             self._wrong = refusals(self.parameters.found, self.config.vehicle)
+        elif kind == "TIMESYNC":
+            self.clocks.take(message, received_ns)
+        elif kind == "POSITION_TARGET_LOCAL_NED" and self.engagement.phase == "engaged":
+            self.foreign.flown_to(message, received_ns)
 
     # -- out ----------------------------------------------------------------------------------------------------
     def tick(self, now_ns: int) -> list[Any]:
@@ -92,8 +108,10 @@ class Bridge:
             return out
         if self._is_due("ask", now_ns, _ASK_AGAIN_NS):
             out.extend(self._requests(system, now_ns))
+        out.extend(self.clocks.due(now_ns))
         if self.config.check_parameters:
-            out.extend(self.parameters.due(system, now_ns))
+            still = not self.telemetry.armed and self.engagement.phase in ("quiet", "released")
+            out.extend(self.parameters.due(system, now_ns, may_set=still))
         odometry = self.vision.message(now_ns)
         if odometry is not None:
             out.append(odometry)
@@ -112,7 +130,8 @@ class Bridge:
         """Return what the engagement looks at."""
         t = self.telemetry
         heard = t.age_s(now_ns) <= self.config.link_lost_s
-        return Vehicle(heard, t.armed, t.mode, t.landed == "on_ground", t.fused(now_ns), self.refusal())
+        return Vehicle(heard, t.armed, t.mode, t.landed == "on_ground", t.fused(now_ns), self.refusal(),
+                       self.foreign.word(now_ns), t.arming_word, t.failsafe)  # fmt: skip
 
     def refusal(self) -> str:
         """Return why the vehicle must not be flown, in words; empty when nothing speaks against it."""
@@ -128,7 +147,7 @@ class Bridge:
         e = self.engagement
         return self.telemetry.state(
             now_ns, self._seq, connected=self.vehicle(now_ns).heard, override=e.override, mission_id=e.mission_id,
-            note=self._far or e.note or self.refusal(),
+            note=self._far or e.note or self.refusal() or self.clocks.word(now_ns),
         )  # fmt: skip
 
     def _is_due(self, what: str, now_ns: int, period_ns: int) -> bool:
@@ -146,7 +165,10 @@ class Bridge:
             asked = self.telemetry.acks.get(mav.MAV_CMD_SET_MESSAGE_INTERVAL) is not None
             if not asked or came is None or (now_ns - came) / 1e9 > max(3.0 / rate_hz, 0.5):
                 out.append(px4.interval(message_id, rate_hz, system))
-        if not self.telemetry.origin_known:
+        # never in flight: a new origin may move PX4's estimate
+        on_ground = not self.telemetry.armed and self.telemetry.landed != "in_air"
+        if not self.telemetry.origin_known and on_ground and self._origins_sent < _ORIGINS:
+            self._origins_sent += 1
             c = self.config
             lat, lon, alt = round(c.origin_lat_deg * 1e7), round(c.origin_lon_deg * 1e7), round(c.origin_alt_m * 1e3)
             out.append(mav.MAVLink_set_gps_global_origin_message(system, lat, lon, alt, time_usec=now_ns // 1000))
@@ -166,6 +188,7 @@ class Bridge:
         self._sent = (position, yaw)
         self.setpoints_sent += 1
         p, v = to_ned(position), to_ned(velocity)
+        self.foreign.sent(p, now_ns)
         message = mav.MAVLink_set_position_target_local_ned_message(
             (now_ns // 1_000_000) & 0xFFFFFFFF, system, px4.AUTOPILOT_COMPONENT, mav.MAV_FRAME_LOCAL_NED,
             _USE_POSITION_VELOCITY_YAW_RATE, float(p[0]), float(p[1]), float(p[2]), float(v[0]), float(v[1]),
@@ -178,7 +201,7 @@ class Bridge:
         self._far = ""
         g = self.engagement.usable(now_ns)
         last = self.vision.track.latest
-        if g is None or g.setpoint is None or last is None or g.stamp_ns <= self._moved_ns:
+        if g is None or g.setpoint is None or last is None or g.stamp_ns <= self._moved_ns or self.engagement.holds:
             return None
         correction = None
         if (g.map_id, g.reset_counter) != (last.map_id, last.reset_counter):

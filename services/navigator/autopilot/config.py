@@ -18,6 +18,11 @@ class AutopilotConfig(BaseModel):
     """Which parameters preflight asks for: on a real aircraft the sticks must win."""
     check_parameters: bool = True
     """Refuse to engage while a parameter that a flight rests on is not as it has to be."""
+    set_parameters: bool = False
+    """Set those that differ, on the ground and disarmed; some take effect when the autopilot is started again."""
+    signing_key: str = ""
+    """File with the secret of MAVLink signing (32 bytes are made of it by SHA-256); empty: messages are not signed.
+    With it, messages that are not signed with the same secret are refused."""
     system_id: int = Field(default=1, ge=1, le=255)
     """Ours until the autopilot's first heartbeat; then the autopilot's own."""
     component_id: int = Field(default=191, ge=1, le=255)

@@ -33,6 +33,12 @@ class Vehicle:
     vision_fused: bool
     refusal: str = ""
     """Why this vehicle must not be flown: a parameter that is not as it has to be."""
+    foreign: str = ""
+    """Who else is at the controls, in words."""
+    arming: str = ""
+    """What the autopilot answered when it was asked to arm, in words."""
+    failsafe: bool = False
+    """The autopilot says of itself that it acts by a failsafe."""
 
 
 class Engagement:
@@ -51,6 +57,7 @@ class Engagement:
         self._hold_since_ns: int | None = None
         self._ground_since_ns: int | None = None
         self._in_offboard = False
+        self._foreign = ""
         self._land_seen = False
         self._mode_before = ""
         """The mode in which the vehicle stood when we began: the pilot changes it to say no."""
@@ -59,6 +66,11 @@ class Engagement:
     def streams(self) -> bool:
         """Whether setpoints may go out."""
         return self.phase in _STREAMING or (self.phase == "landing" and self._in_offboard)
+
+    @property
+    def holds(self) -> bool:
+        """Whether the aircraft is held although there is guidance: somebody else is at the controls."""
+        return bool(self._foreign) and self.phase == "engaged"
 
     @property
     def override(self) -> bool:
@@ -110,11 +122,12 @@ class Engagement:
             return self._release(vehicle, now_ns)
         if self.usable(now_ns) is None:
             return self._cancel("the navigator took its order back", now_ns)
-        ready = vehicle.vision_fused and not vehicle.refusal
+        refusal = vehicle.refusal or vehicle.foreign
+        ready = vehicle.vision_fused and not refusal
         if ready and self._elapsed_s(now_ns) >= self.config.stream_before_offboard_s:
             self._go("switching", "asking for offboard", now_ns)
         elif self._elapsed_s(now_ns) > self.config.engage_timeout_s:
-            return self._cancel(vehicle.refusal or "the autopilot does not use the vision pose", now_ns)
+            return self._cancel(refusal or "the autopilot does not use the vision pose", now_ns)
         return []
 
     def _switch(self, vehicle: Vehicle, now_ns: int) -> list[Order]:
@@ -138,7 +151,7 @@ class Engagement:
         if self.usable(now_ns) is None:
             return self._cancel("the navigator took its order back", now_ns)
         if self._elapsed_s(now_ns) > self.config.engage_timeout_s:
-            return self._cancel("the autopilot refuses to arm", now_ns)
+            return self._cancel(f"the autopilot refuses to arm{vehicle.arming and ': '}{vehicle.arming}", now_ns)
         return self._ask("arm", now_ns)
 
     def _fly(self, vehicle: Vehicle, now_ns: int) -> list[Order]:
@@ -148,13 +161,17 @@ class Engagement:
             self._go("released", "disarmed, not by us", now_ns)
             return []
         g = self.usable(now_ns)
-        if g is None:
+        self._foreign = vehicle.foreign
+        if g is None or self._foreign:
+            why = self._foreign or "no guidance"
             if self._hold_since_ns is None:
                 self._hold_since_ns = now_ns
-                self.note = "no guidance: holding"
-            if (now_ns - self._hold_since_ns) / 1e9 > self.config.guidance_land_s:
-                return self._begin_landing("no guidance: landing", now_ns)
+                self.note = f"{why}: holding"
+            if (now_ns - self._hold_since_ns) / 1e9 > self.config.guidance_land_s or (g is not None and g.land):
+                return self._begin_landing(f"{why}: landing", now_ns)
             return []
+        if self._hold_since_ns is not None:
+            self.note = f"engaged for mission {self.mission_id}"
         self._hold_since_ns = None
         return self._begin_landing("landing as ordered", now_ns) if g.land else []
 
@@ -183,7 +200,8 @@ class Engagement:
     def _release(self, vehicle: Vehicle, now_ns: int) -> list[Order]:
         self._go(
             "released",
-            f"mode {vehicle.mode}, not by us: the pilot has the aircraft, or PX4 acts by its own failsafe",
+            f"mode {vehicle.mode}, not by us: "
+            + ("PX4 acts by its own failsafe" if vehicle.failsafe else "the pilot has the aircraft, or PX4's failsafe"),
             now_ns,
         )
         return []

@@ -5,11 +5,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import socket
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Protocol
 
 from pymavlink.dialects.v20 import common as mav
@@ -20,7 +23,10 @@ from services.navigator.autopilot.bridge import timesync_answer
 LOG = logging.getLogger(__name__)
 
 _WAIT_S = 0.2
+_AGAIN_S = 0.5
 _MAX_QUEUE = 4_000
+_SIGNING_EPOCH_S = 1_420_070_400
+"""1 January 2015, where MAVLink's signing time begins."""
 _FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
 
 
@@ -151,15 +157,43 @@ def open_wire(connection: str) -> Wire:
         raise InputError(f"autopilot.connection {connection!r}: {error}") from error
 
 
+def read_secret(path: str) -> bytes | None:
+    """Return the secret in a file, None without a path.
+
+    Raises:
+        InputError: the file cannot be read or is empty.
+    """
+    if not path:
+        return None
+    try:
+        secret = Path(path).read_bytes().strip()
+    except OSError as error:
+        raise InputError(f"autopilot.signing_key {path}: {error.strerror}") from error
+    if not secret:
+        raise InputError(f"autopilot.signing_key {path}: the file is empty, expected a secret")
+    return secret
+
+
 class Codec:
     """MAVLink 2 messages to bytes and back; TIMESYNC requests are answered here, with the clock of that very moment."""
 
-    def __init__(self, component: int, system: int, now_ns: Callable[[], int]) -> None:
+    def __init__(self, component: int, system: int, now_ns: Callable[[], int], secret: bytes | None = None) -> None:
         self._mav = mav.MAVLink(None, srcSystem=system, srcComponent=component)
         self._mav.robust_parsing = True
+        if secret is not None:
+            self._sign(secret)
         self._lock = threading.Lock()
         self._now_ns = now_ns
         self.bad_bytes = 0
+
+    def _sign(self, secret: bytes) -> None:
+        """Sign what goes out and refuse what comes unsigned or wrongly signed (MAVLink 2, message signing)."""
+        signing = self._mav.signing
+        signing.secret_key = hashlib.sha256(secret).digest()
+        signing.sign_outgoing = True
+        # in 10 microseconds since 2015, on the wall's clock: it has to rise over restarts
+        signing.timestamp = int((time.time() - _SIGNING_EPOCH_S) * 1e5)
+        signing.link_id = self._mav.srcComponent
 
     def identify(self, system: int) -> None:
         """Speak as a component of this system from now on."""
@@ -184,6 +218,8 @@ class Codec:
                 reply = timesync_answer(message, self._now_ns())
                 if reply is not None:
                     answer(self.pack(reply))
+                else:
+                    out.append((message, received_ns))
             else:
                 out.append((message, received_ns))
         return out
@@ -192,8 +228,9 @@ class Codec:
 class MavlinkLink:
     """A wire with MAVLink 2 on it. Its thread parses what comes and answers TIMESYNC at once."""
 
-    def __init__(self, wire: Wire, codec: Codec) -> None:
+    def __init__(self, wire: Wire, codec: Codec, reopen: Callable[[], Wire] | None = None) -> None:
         self._wire = wire
+        self._reopen = reopen
         self.codec = codec
         self._queue: deque[tuple[Any, int]] = deque(maxlen=_MAX_QUEUE)
         self._stopped = threading.Event()
@@ -230,14 +267,27 @@ class MavlinkLink:
         except OSError as error:
             self.failed = str(error)
 
+    def _open_again(self) -> None:
+        """Replace a dead wire: a TCP server that was restarted, a plug that was pulled. The bridge saw the gap."""
+        if self._reopen is None:
+            return
+        try:
+            fresh = self._reopen()
+        except (InputError, OSError) as error:
+            self.failed = str(error)
+            return
+        self._wire.close()
+        self._wire, self.failed = fresh, ""
+
     def _read(self) -> None:
         while not self._stopped.is_set():
             try:
                 data = self._wire.read()
-            except OSError as error:
+            except OSError as error:  # pyserial's errors are OSErrors too
                 self.failed = str(error)
-                if self._stopped.wait(_WAIT_S):
+                if self._stopped.wait(_AGAIN_S):
                     return
+                self._open_again()
                 continue
             if data:
                 self._queue.extend(self.codec.take(data, self._write))

@@ -10,7 +10,7 @@ import math
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from pymavlink.dialects.v20 import common as mav
 
@@ -130,13 +130,22 @@ def setting(p: Parameter, system: int) -> mav.MAVLink_param_set_message:
 
 
 class ParameterReader:
-    """Asks for all parameters of a kind of vehicle, a few at a time, until each has answered or was asked often."""
+    """Asks for all parameters of a kind of vehicle, a few at a time, until each has answered or was asked often.
 
-    def __init__(self, kind: VehicleKind) -> None:
+    With ``change`` it then sets those that differ and reads them back. Who did not answer is asked again now and then:
+    an autopilot that boots is slow.
+    """
+
+    def __init__(self, kind: VehicleKind, *, change: bool = False) -> None:
         self.kind = kind
+        self.change = change
         self.found: dict[str, float] = {}
+        self.changed: dict[str, float] = {}
+        """What was set by us, and the value before."""
         self._asked: dict[str, int] = {}
+        self._set: dict[str, int] = {}
         self._due_ns = 0
+        self._again_ns = 0
 
     @property
     def complete(self) -> bool:
@@ -147,15 +156,29 @@ class ParameterReader:
         """Take a PARAM_VALUE."""
         self.found[name.rstrip("\0")] = read_value(value, kind)
 
-    def due(self, system: int, now_ns: int) -> list[mav.MAVLink_param_request_read_message]:
-        """Return the questions to send now."""
-        if self.complete or now_ns < self._due_ns:
+    def due(self, system: int, now_ns: int, *, may_set: bool = False) -> list[Any]:
+        """Return the questions, and where it may set, the orders to send now."""
+        if now_ns < self._due_ns:
             return []
         self._due_ns = now_ns + _ASK_EVERY_NS
-        open_ = [p for p in wanted(self.kind) if p.name not in self.found and self._asked.get(p.name, 0) < _TRIES]
-        for p in open_[:_AT_ONCE]:
-            self._asked[p.name] = self._asked.get(p.name, 0) + 1
-        return [request(p, system) for p in open_[:_AT_ONCE]]
+        if not self.complete:
+            open_ = [p for p in wanted(self.kind) if p.name not in self.found and self._asked.get(p.name, 0) < _TRIES]
+            for p in open_[:_AT_ONCE]:
+                self._asked[p.name] = self._asked.get(p.name, 0) + 1
+            self._again_ns = now_ns + _AGAIN_NS
+            return [request(p, system) for p in open_[:_AT_ONCE]]
+        if now_ns >= self._again_ns:
+            self._again_ns = now_ns + _AGAIN_NS
+            return [request(p, system) for p in wanted(self.kind) if p.name not in self.found]
+        return self._settings(system) if self.change and may_set else []
+
+    def _settings(self, system: int) -> list[Any]:
+        wrong = [d for d in differences(self.found, self.kind) if d.found is not None]
+        due = [d for d in wrong if self._set.get(d.parameter.name, 0) < _TRIES][:_AT_ONCE]
+        for d in due:
+            self._set[d.parameter.name] = self._set.get(d.parameter.name, 0) + 1
+            self.changed.setdefault(d.parameter.name, d.found if d.found is not None else 0.0)
+        return [setting(d.parameter, system) for d in due]
 
 
-_TRIES, _AT_ONCE, _ASK_EVERY_NS = 5, 6, 200_000_000
+_TRIES, _AT_ONCE, _ASK_EVERY_NS, _AGAIN_NS = 5, 6, 200_000_000, 10_000_000_000

@@ -30,6 +30,7 @@ STREAMS_HZ: dict[int, float] = {
     mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
     mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 5.0,
     mav.MAVLINK_MSG_ID_SYS_STATUS: 2.0,
+    mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: 5.0,
 }
 """What we ask for with SET_MESSAGE_INTERVAL. The heartbeat at 10 Hz, so that a pilot who takes over is noticed in
 0.1 s instead of 1 s."""

@@ -11,7 +11,7 @@ from schemas.topics import MISSION_GUIDANCE, SLAM_POSE, VEHICLE_STATE
 from services.common.context import Context
 from services.navigator.autopilot.bridge import Bridge
 from services.navigator.autopilot.config import AutopilotConfig
-from services.navigator.autopilot.link import Codec, Link, MavlinkLink, open_wire
+from services.navigator.autopilot.link import Codec, Link, MavlinkLink, open_wire, read_secret
 
 LOG = logging.getLogger(__name__)
 
@@ -25,6 +25,8 @@ class Autopilot:
         self.bridge = Bridge(config)
         self._identified = False
         self._note = ""
+        self._told = 0
+        """How many parameters were told to have been set."""
 
     def register(self) -> None:
         """Connect to the bus."""
@@ -65,6 +67,16 @@ class Autopilot:
         book.counters["odometry_sent"] = self.bridge.vision.sent
         book.counters["setpoints_sent"] = self.bridge.setpoints_sent
         book.counters["setpoints_refused"] = self.bridge.setpoints_refused
+        bridge = self.bridge
+        book.counters["clock_jumps"] = bridge.clocks.jumps
+        if bridge.clocks.round_trip_ns is not None:
+            book.counters["timesync_round_trip_us"] = bridge.clocks.round_trip_ns // 1000
+        book.note("clocks", bridge.clocks.word(now_ns))
+        book.note("controls", bridge.foreign.word(now_ns))
+        if bridge.parameters.changed and len(bridge.parameters.changed) != self._told:
+            self._told = len(bridge.parameters.changed)
+            was = ", ".join(f"{name} (was {value:g})" for name, value in bridge.parameters.changed.items())
+            LOG.warning("parameters set: %s; start the autopilot again, some take effect only then", was)
         book.note("link", "" if state.connected else "no word from the autopilot: is it running, is the address right?")
         book.note("wire", getattr(self._link, "failed", ""))
 
@@ -72,8 +84,10 @@ class Autopilot:
 def build(context: Context) -> None:
     """Start the bridge on a context, over the wire that the configuration names."""
     config: AutopilotConfig = getattr(context.config, "autopilot", None) or AutopilotConfig()
-    codec = Codec(config.component_id, config.system_id, context.clock.now_ns)
-    link = MavlinkLink(open_wire(config.connection), codec)
+    codec = Codec(config.component_id, config.system_id, context.clock.now_ns, read_secret(config.signing_key))
+    stream = config.connection.startswith(("tcp:", "serial:"))
+    reopen = (lambda: open_wire(config.connection)) if stream else None
+    link = MavlinkLink(open_wire(config.connection), codec, reopen)
     atexit.register(link.close)
     on_stop = getattr(context, "on_stop", None)
     if on_stop is not None:

@@ -17,6 +17,10 @@ _LANDED: dict[int, LandedState] = {
     mav.MAV_LANDED_STATE_ON_GROUND: "on_ground", mav.MAV_LANDED_STATE_IN_AIR: "in_air",
     mav.MAV_LANDED_STATE_TAKEOFF: "taking_off", mav.MAV_LANDED_STATE_LANDING: "landing",
 }  # fmt: skip
+_RESULTS = {
+    mav.MAV_RESULT_TEMPORARILY_REJECTED: "temporarily rejected", mav.MAV_RESULT_DENIED: "denied",
+    mav.MAV_RESULT_UNSUPPORTED: "unsupported", mav.MAV_RESULT_FAILED: "failed",
+}  # fmt: skip
 _FUSED_FLAGS = mav.ESTIMATOR_POS_HORIZ_REL | mav.ESTIMATOR_POS_HORIZ_ABS
 _AGREE_M, _AGREE_RAD, _AGREE_S = 0.4, math.radians(20.0), 0.5
 _FRESH_S = 1.0
@@ -38,6 +42,9 @@ class Telemetry:
         self.position_ns = 0
         self.estimator_flags: int | None = None
         self.origin_known = False
+        self.failsafe = False
+        self.may_arm: bool | None = None
+        """The autopilot's own verdict on arming, where it tells one."""
         self.came_ns: dict[int, int] = {}
         """Last arrival of each message id."""
         self.acks: dict[int, int] = {}
@@ -56,6 +63,7 @@ class Telemetry:
             self.system = system
             self.armed = bool(message.base_mode & mav.MAV_MODE_FLAG_SAFETY_ARMED)
             self.mode = mode_name(message.custom_mode)
+            self.failsafe = message.system_status in (mav.MAV_STATE_CRITICAL, mav.MAV_STATE_EMERGENCY)
         if self.system is None:
             return False
         self.heard_ns = received_ns
@@ -86,6 +94,15 @@ class Telemetry:
         if self._agrees_since_ns is None or (now_ns - self._agrees_since_ns) / 1e9 < _AGREE_S:
             return False
         return self.estimator_flags is None or bool(self.estimator_flags & _FUSED_FLAGS)
+
+    @property
+    def arming_word(self) -> str:
+        """What the autopilot answered when asked to arm, and what it says of its checks; empty when it is content."""
+        result = self.acks.get(mav.MAV_CMD_COMPONENT_ARM_DISARM, mav.MAV_RESULT_ACCEPTED)
+        words = [] if result == mav.MAV_RESULT_ACCEPTED else [_RESULTS.get(result, f"result {result}")]
+        if self.may_arm is False:
+            words.append("its pre-arm checks fail (its ground station shows why)")
+        return ", ".join(words)
 
     def state(
         self, now_ns: int, seq: int, *, connected: bool, override: bool, mission_id: int, note: str
@@ -119,6 +136,9 @@ class Telemetry:
 
     def _on_sys_status(self, message: Any, _: int) -> None:  # noqa: ANN401
         self._battery(message.battery_remaining)
+        check = mav.MAV_SYS_STATUS_PREARM_CHECK
+        if message.onboard_control_sensors_enabled & check:
+            self.may_arm = bool(message.onboard_control_sensors_health & check)
 
     def _on_battery_status(self, message: Any, _: int) -> None:  # noqa: ANN401
         self._battery(message.battery_remaining)

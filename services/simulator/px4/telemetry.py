@@ -117,6 +117,17 @@ def odometry(v: Vehicle) -> Message:
     )  # fmt: skip
 
 
+def position_target_local_ned(v: Vehicle) -> Message:
+    """POSITION_TARGET_LOCAL_NED: what the controller flies to, while it flies to somebody's setpoint."""
+    if v.commander.state is not NavState.OFFBOARD or not v.commander.armed or not v.external.has_position:
+        return None
+    p, s = v.external.position_m, np.nan_to_num(v.external.velocity_m_s)
+    return m.MAVLink_position_target_local_ned_message(
+        _boot_ms(v), m.MAV_FRAME_LOCAL_NED, 0, *(float(c) for c in p), *(float(c) for c in s), 0.0, 0.0, 0.0,
+        v.external.yaw_rad, v.external.yaw_rate_rad_s,
+    )  # fmt: skip
+
+
 def extended_sys_state(v: Vehicle) -> Message:
     """EXTENDED_SYS_STATE: on the ground, taking off, in the air, landing."""
     landed = _LANDED[v.land.state]
@@ -227,6 +238,7 @@ BUILDERS: dict[int, Builder] = {
     m.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: attitude_quaternion,
     m.MAVLINK_MSG_ID_LOCAL_POSITION_NED: local_position_ned,
     m.MAVLINK_MSG_ID_ODOMETRY: odometry,
+    m.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: position_target_local_ned,
     m.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: extended_sys_state,
     m.MAVLINK_MSG_ID_ESTIMATOR_STATUS: estimator_status,
     m.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: gps_global_origin,
