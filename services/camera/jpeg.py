@@ -203,7 +203,7 @@ def _skip_scan(array: Bytes, position: int) -> int:
         position += 1
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _code(table: Ints, window: int) -> tuple[int, int]:
     """Return (length, symbol) of the code that a 16 bit window begins with; length 0: there is none."""
     entry = table[window >> (16 - _LUT_BITS)]
@@ -221,7 +221,7 @@ def _code(table: Ints, window: int) -> tuple[int, int]:
     return 0, 0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, inline="always")
 def _refill(data: Bytes, position: int, bits: int, held: int) -> tuple[int, int, int]:
     """Take in bytes until 32 bits (one code and what follows it) are held or a marker comes."""
     while held < 32 and position < data.size:
@@ -242,12 +242,13 @@ def _block(
 ) -> tuple[int, int, int, int, int, float]:
     """Walk one block; return (fault, position, bits, held, its DC value, the square of its coefficients' norm)."""
     k, energy = 0, 0.0
+    table, further = tables[0], tables[1]
     while k < 64:
         if held < 32:
             position, bits, held = _refill(data, position, bits, held)
         # behind the data there are zeros; who uses them has ended early
         window = ((bits >> (held - 16)) if held >= 16 else (bits << (16 - held))) & 0xFFFF
-        length, symbol = _code(tables[0 if k == 0 else 1], window)
+        length, symbol = _code(table, window)
         if length == 0:
             return (_BAD_CODE if held >= 16 else _TOO_SHORT), position, bits, held, dc, energy
         extra = symbol & 15
@@ -261,15 +262,15 @@ def _block(
             if symbol > 15:
                 return _BAD_CODE, position, bits, held, dc, energy
             dc += value
-            energy = float(dc * steps[0]) ** 2
-            k = 1
+            energy = float(dc * steps[0] * dc * steps[0])
+            k, table = 1, further
             continue
         if extra == 0 and symbol != 0xF0:
             break
         k += symbol >> 4
         if k > 63:
             return _BAD_RUN, position, bits, held, dc, energy
-        energy += float(value * steps[k]) ** 2
+        energy += float(value * steps[k] * value * steps[k])
         k += 1
     return _WHOLE, position, bits, held, dc, energy
 
