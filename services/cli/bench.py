@@ -33,6 +33,9 @@ def bench(
     data: DataFolder = None,
     scenes: Annotated[str, typer.Option("--scenes", help="Only these scenes, names separated by commas")] = "",
     count: Annotated[int | None, typer.Option("--count", min=1, help="How many runs (missions)")] = None,
+    rendered: Annotated[
+        bool, typer.Option("--rendered", help="With rendered images, real processes (missions)")
+    ] = False,
     quick: Annotated[bool, typer.Option("--quick", help="Less data: a look, not a measurement")] = False,
     doc: Annotated[Path | None, typer.Option("--doc", help="Put the result into this Markdown file")] = None,
     keep_sequences: KeepSequences = False,
@@ -44,13 +47,14 @@ def bench(
 
     run = load_bench(name)
     options = BenchOptions(
-        seed=seed, out=out, scenes=tuple(part.strip() for part in scenes.split(",") if part.strip()), quick=quick, keep_sequences=keep_sequences, count=count,
+        seed=seed, out=out, scenes=tuple(part.strip() for part in scenes.split(",") if part.strip()), quick=quick,
+        keep_sequences=keep_sequences, count=count, rendered=rendered,
         tell=lambda line: typer.echo(line, err=True), **({"data": data} if data is not None else {}),
     )  # fmt: skip
     report = run(options)
     text = section_text(report)
     if doc is not None:
-        write_section(doc, name, text)
+        write_section(doc, f"{name}-rendered" if rendered else name, text)
     typer.echo(text, err=as_json)
     if as_json:
         typer.echo(json.dumps({"bench": name, "figures": dict(report.figures)}))

@@ -44,6 +44,8 @@ class BenchOptions:
     """Names of scenes to do; empty: all."""
     count: int | None = None
     """How many runs, for benchmarks that fly or draw as many as wanted."""
+    rendered: bool = False
+    """With rendered images and real processes, where a benchmark can do without (missions)."""
     quick: bool = False
     """Less data, for a look; figures then say less."""
     keep_sequences: bool = False

@@ -19,7 +19,7 @@ from services.navigator.config import NavigatorConfig
 
 _CODE = (
     "schemas", "services.navigator", "services.navigator.autopilot", "services.simulator.px4",
-    "services.evaluate.flight", "services.evaluate.synthetic",
+    "services.evaluate.flight", "services.evaluate.synthetic", "services.evaluate.eyes",
 )  # fmt: skip
 _COUNT, _QUICK_COUNT = 50, 10
 _LIMIT_S = 300.0
@@ -27,6 +27,10 @@ _LIMIT_S = 300.0
 
 def run(options: BenchOptions) -> BenchReport:
     """Fly what is not flown yet, and report on all."""
+    if options.rendered:
+        from services.evaluate.bench_missions_rendered import run as rendered
+
+        return rendered(options)
     count = options.count or (_QUICK_COUNT if options.quick else _COUNT)
     first = 1000 * (options.seed or 0)
     version = code_version(_CODE)

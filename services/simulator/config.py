@@ -63,6 +63,8 @@ class FlightConfig(BaseModel):
     """Wall time after which time goes on without a living service that does not answer, until it does."""
     max_speed: float = Field(default=2.0, gt=0.0, le=20.0)
     """Simulated seconds per second at most; 1 at most while a service is missing."""
+    drop_share: float = Field(default=0.0, ge=0.0, lt=0.9)
+    """Share of the camera's frames that never arrive, drawn from the simulator's seed."""
     limit_s: float = Field(default=600.0, gt=0.0)
     """Simulated time after which the flight is broken off."""
 

@@ -11,6 +11,8 @@ import time
 from collections.abc import Callable
 from typing import Literal
 
+import numpy as np
+
 from schemas.camera import RgbdFrame
 from schemas.navigation import Guidance
 from schemas.simulation import SimClock
@@ -81,6 +83,8 @@ class Flight:
         self._frame_ns = -1
         """Stamp of the last frame sent."""
         self._due_ns = float(START_STAMP_NS)
+        self._lottery = np.random.default_rng([config.seed, 303])
+        self._dropped = False
         self._rendered: tuple[RgbdFrame, Floats] | None = None
         self._credit_s, self._earned_at_s = 0.0, wall()
         self._listen()
@@ -122,6 +126,9 @@ class Flight:
             return
         if self._rendered is None and self.now_ns >= self._due_ns:
             self._rendered = self._render()
+        elif self._rendered is not None and self._dropped:
+            self._rendered, self._dropped = None, self._drops()
+            self._due_ns += 1e9 / self._config.rate_hz
         elif self._rendered is not None:
             if not self._followers.waits(_SEES, self._frame_ns, now_s):
                 self._send(*self._rendered)
@@ -177,7 +184,7 @@ class Flight:
 
     def _send(self, frame: RgbdFrame, T_world_camera: Floats) -> None:
         """Publish a frame with its truth; the flight has begun once somebody answers frames."""
-        self._rendered, self._frame_ns = None, frame.stamp_ns
+        self._rendered, self._frame_ns, self._dropped = None, frame.stamp_ns, self._drops()
         self._context.publish(SIM_TRUTH, self.stage.truth(T_world_camera, frame.seq, frame.stamp_ns))
         self._context.publish(SIM_RGBD, frame)
         self.frames += 1
@@ -185,6 +192,10 @@ class Flight:
         self._due_ns += 1e9 / self._config.rate_hz
         if self.phase == "waiting" and self._followers.complete:
             self.phase = "running"
+
+    def _drops(self) -> bool:
+        """Draw whether the next frame never arrives; none is lost before the flight has begun."""
+        return self.phase == "running" and bool(self._lottery.random() < self._config.flight.drop_share)
 
     def _tell(self) -> None:
         """Say whom time does not wait for."""
