@@ -65,8 +65,9 @@ class Slam:
         self.loops = Loops(self.mapping, self.tracking, Places(vocabulary.load()), config)
         self.reset_counter = 0
         self.graph_version = 0
-        self.up_sigma_rad = gravity.SIGMA_UNKNOWN_RAD
-        self._level = gravity.Level()
+        self._upright = gravity.Upright()
+        self._felt: tuple[int, F64 | None, F64 | None] | None = None
+        """Stamp, specific force and the autopilot's up of the last frame, when it was located."""
         self._last: Tracked | None = None
         self._step = np.eye(4)
         """T_camera_lastcamera of the last two tracked frames: the constant velocity."""
@@ -107,22 +108,20 @@ class Slam:
             if self.graph_version == 0:
                 return self._initialise(stamp_ns, features, accel_camera, attitude_up_camera)
             graph = self._catch_up()
+            graph = self._level_map() or graph
             frame = self._locate(features)
             if frame is None and self.config.relocalise:
                 frame = self._relocalise(features)
                 graph = self._catch_up() or graph
             if frame is None:
                 return self._lost(stamp_ns, graph)
-            levelled = self._level_map(stamp_ns, frame, accel_camera, attitude_up_camera)
-            return self._accept(stamp_ns, frame, graph, levelled=levelled)
+            self._felt = (stamp_ns, accel_camera, attitude_up_camera)
+            return self._accept(stamp_ns, frame, graph)
 
     def _initialise(self, stamp_ns: int, features: Features, accel: F64 | None, attitude: F64 | None) -> TrackResult:
         if np.count_nonzero(features.depth > 0.0) < _MIN_START_POINTS:
             return self._result(stamp_ns, "initialising", None, [], None)
-        up = attitude if attitude is not None else accel
-        if up is not None:
-            self.up_sigma_rad = gravity.SIGMA_ACCEL_RAD if attitude is None else gravity.SIGMA_ATTITUDE_RAD
-        T_camera_map = inverse(gravity.first_pose(up))
+        T_camera_map = inverse(gravity.first_pose(self._upright.begin(accel, attitude)))
         frame = Tracked(
             features, np.ascontiguousarray(T_camera_map[:3, :3]), T_camera_map[:3, 3].copy(),
             np.full(len(features), -1, np.int32), len(features), np.eye(6) * 1e8,
@@ -144,7 +143,6 @@ class Slam:
     def _tell_jump(self, jump_m: float, jump_rad: float) -> None:
         """Count a jump when a loop moved the camera."""
         if self.loops.closed != self._closed and (jump_m > _JUMP_M or jump_rad > _JUMP_RAD):
-            self._level.restart()
             self._count_reset()
 
     def _corrected(self) -> GraphUpdate:
@@ -169,24 +167,27 @@ class Slam:
             return None
         return joined[0]
 
-    def _level_map(self, stamp_ns: int, frame: Tracked, accel: F64 | None, attitude: F64 | None) -> bool:
-        """Turn the map upright when gravity is known better; True when it was turned."""
-        if accel is None or attitude is not None:
-            return False
-        found = self._level.add(stamp_ns, inverse(pose(frame.R, frame.t)), np.asarray(accel, dtype=float))
-        if found is None:
-            return False
-        up, self.up_sigma_rad = found
-        first = self.atlas.slots[0]
-        R = gravity.levelling(up, self.atlas.keyframes.R[first, 2])
+    def _level_map(self) -> GraphUpdate | None:
+        """Turn the map upright when gravity is known better by the last frame; return the new graph."""
+        felt, self._felt = self._felt, None
+        if felt is None:
+            return None
+        stamp_ns, accel, attitude = felt
+        up = self._upright.feel(stamp_ns, self._reference, self._anchor, accel, attitude, self.mapping.keyframe_pose)
+        if up is None:
+            return None
+        R = gravity.levelling(up, self.atlas.keyframes.R[self.atlas.slots[0], 2])
         self.mapping.turn(R)
-        self._level.turn(R)
-        for located in (self._last, frame):
-            if located is not None:
-                located.R = np.ascontiguousarray(located.R @ R.T)
-        if np.arccos(np.clip(up[2], -1.0, 1.0)) > _JUMP_RAD:
-            self._count_reset()
-        return True
+        if self._last is not None:
+            self._last.R = np.ascontiguousarray(self._last.R @ R.T)
+        self._count_reset()
+        self.graph_version += 1
+        return self._graph("full_ba")
+
+    @property
+    def up_sigma_rad(self) -> float:
+        """Return the doubt of the map's vertical, standard deviation."""
+        return self._upright.sigma_rad
 
     def _relocalise(self, features: Features) -> Tracked | None:
         """Return the frame located anywhere in the map; that is a jump, and told as one."""
@@ -197,25 +198,19 @@ class Slam:
                 self.mapping.revision += 1
             self._last = None
             self._step = np.eye(4)
-            self._level.restart()
             self._count_reset()
         return frame
 
     def _count_reset(self) -> None:
         self.reset_counter = (self.reset_counter + 1) % 256
 
-    def _accept(
-        self, stamp_ns: int, frame: Tracked, graph: GraphUpdate | None, *, levelled: bool = False
-    ) -> TrackResult:
+    def _accept(self, stamp_ns: int, frame: Tracked, graph: GraphUpdate | None) -> TrackResult:
         """Remember a frame that has its pose, and make a keyframe of it when the map needs one."""
         if self._last is not None:
             self._step = pose(frame.R, frame.t) @ inverse(pose(self._last.R, self._last.t))
         new: list[NewKeyframe] = []
         if self._needs_keyframe(frame):
             new, graph = self._make_keyframe(frame, graph)
-        elif levelled:
-            self.graph_version += 1
-            graph = self._graph("full_ba")
         self._set_anchor(frame)
         self._last = frame
         if self._trail is not None:
@@ -260,7 +255,7 @@ class Slam:
     def resume(self, map_id: str, graph_version: int, reset_counter: int, up_sigma_rad: float, era: int) -> None:
         """Go on with a map that was put into the atlas: nothing is told of it until a frame is located in it."""
         self.map_id, self.graph_version, self.reset_counter = map_id, graph_version, reset_counter
-        self.up_sigma_rad, self._era0, self._taken_up = up_sigma_rad, era, True
+        self._upright.sigma_rad, self._era0, self._taken_up = up_sigma_rad, era, True
 
     def _set_anchor(self, frame: Tracked) -> None:
         kf = self.atlas.keyframes
