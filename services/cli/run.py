@@ -41,7 +41,7 @@ _TRIES = 4
 def run(
     *,
     source: Annotated[
-        str | None, typer.Option("--source", help="sim, tum:DIR, mcap:FILE or realsense.", metavar="SOURCE")
+        str | None, typer.Option("--source", help="sim, tum:DIR, mcap:FILE, bag:FILE or realsense.", metavar="SOURCE")
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Of the simulated scene and its noise.", min=0)] = None,
     scene: Annotated[str | None, typer.Option("--scene", help="Name of the simulated scene.")] = None,

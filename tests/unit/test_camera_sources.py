@@ -108,6 +108,28 @@ def test_association_prefers_the_nearest() -> None:
     assert associate(np.array([100, 110]), np.array([99, 112, 300]), 20) == [(0, 0), (1, 1)]
 
 
+@pytest.mark.parametrize(("shift_ms", "told"), [(0, False), (100, True), (-100, True)])
+def test_pairs_of_two_moments_are_told(tmp_path: Path, shift_ms: int, told: bool) -> None:
+    folder = write_tum(tmp_path / "s", 6, associations=True)
+    path = folder / "associations.txt"
+    rows = [line.split() for line in path.read_text().splitlines()]
+    path.write_text("".join(f"{a} {b} {float(c) + shift_ms / 1e3:.6f} {d}\n" for a, b, c, d in rows))
+    source = open_recording(folder, CONFIG)
+    assert len(list(source)) == 6
+    assert ("6 of 6 frames pair colour with depth of another time" in source.total()) == told
+    assert not told or f"{shift_ms + 7:+d} ms" in source.total()
+
+
+def test_lists_whose_stamps_are_shifted_say_by_how_much(tmp_path: Path) -> None:
+    folder = write_tum(tmp_path / "s", 6)
+    rows = [line.split() for line in (folder / "depth.txt").read_text().splitlines()[1:]]
+    (folder / "depth.txt").write_text("".join(f"{float(a) + 0.1:.6f} {b}\n" for a, b in rows))
+    with pytest.raises(
+        InputError, match=r"within 20 ms; the nearest is usually \d+ ms away: are the stamps .* shifted"
+    ):
+        open_recording(folder, CONFIG)
+
+
 def test_a_camera_file_can_be_named(tmp_path: Path) -> None:
     folder = write_tum(tmp_path / "s", 1)
     (folder / "camera.json").unlink()

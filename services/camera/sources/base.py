@@ -29,6 +29,8 @@ class Source(Protocol):
     """How many frames (good or bad) will come, when that is known."""
     paced: bool
     """True when a live replay must wait for the stamps; false for a sensor that sets its own pace."""
+    remark: str
+    """What is odd about the recording as a whole, in one line; empty for nothing."""
 
     def __iter__(self) -> Iterator[RgbdFrame | BadFrame]:
         """Yield the frames once."""

@@ -39,7 +39,7 @@ class ConditionedSource:
 
     def total(self) -> str:
         """Return what was wrong over the whole stream, in one line; empty for nothing."""
-        return "; ".join(part for part in (self.watch.total(), self._scale.note()) if part)
+        return "; ".join(part for part in (self.watch.total(), self._scale.note(), self._source.remark) if part)
 
     def _conditioned(self, frame: RgbdFrame) -> RgbdFrame | BadFrame:
         self.watch.see(frame.stamp_ns, fingerprint(frame))

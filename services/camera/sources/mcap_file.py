@@ -77,6 +77,7 @@ class McapSource:
     """The frames of one MCAP file, from its raw camera channel or else from the compressed one."""
 
     paced = True
+    remark = ""
 
     def __init__(self, path: Path, config: CameraConfig) -> None:
         if not path.is_file():

@@ -45,6 +45,7 @@ class RealsenseSource:
 
     paced = False
     name = "realsense"
+    remark = ""
     expected: int | None = None
 
     def __init__(

@@ -33,6 +33,7 @@ _IMAGE, _COMPRESSED, _INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/Compresse
 _ROS1_MAGIC, _SQLITE_MAGIC, _MCAP_MAGIC = b"#ROSBAG V", b"SQLite format 3\0", b"\x89MCAP0\r\n"
 _REGISTERED = ("aligned_depth_to_color", "depth_registered", "registered", "hw_registered")
 _NOT_COLOUR = ("infra", "ir/", "left", "right", "confidence", "disparity")
+_ALONE_SHARE = 0.1
 _MAX_PENDING = 400
 """Images kept for a partner that comes later in the bag."""
 
@@ -77,6 +78,7 @@ class BagSource:
             self._pairs = dict(associate(colour_ns, depth_ns, within_ns))
             if not self._pairs:
                 raise InputError(f"{path}: no frames: {unpaired(colour_ns, depth_ns, within_ns)}")
+            self.remark = _left_out(len(colour_ns), len(self._pairs), within_ns)
             self.intrinsics, self._registration = self._cameras(reader, config)
         self._colour_ns = colour_ns
         self.expected: int | None = len(self._pairs)
@@ -161,6 +163,13 @@ def choose_topics(reader: AnyReader, path: Path, config: CameraConfig) -> Topics
         chosen[kind] = min(found, key=_depth_rank if kind == "depth" else _colour_rank)
     infos = sorted(c.topic for c in reader.connections if c.msgtype == _INFO and c.msgcount)
     return Topics(chosen["colour"], chosen["depth"], _info_for(chosen["colour"], infos))
+
+
+def _left_out(colours: int, pairs: int, within_ns: int) -> str:
+    alone = colours - pairs
+    if alone <= _ALONE_SHARE * colours:
+        return ""
+    return f"{alone} of {colours} colour images have no depth image within {within_ns / 1e6:.0f} ms"
 
 
 def _depth_rank(topic: str) -> tuple[bool, bool, str]:

@@ -21,7 +21,7 @@ from services.camera.sources.associate import associate, unpaired
 from services.camera.sources.base import BadFrame
 from services.camera.sources.camera_json import read_intrinsics
 from services.camera.sources.registration import registration_for
-from services.camera.sources.text import read_rows, stamp_ns_of
+from services.camera.sources.text import Row, read_rows, stamp_ns_of
 from services.common.errors import InputError
 
 T = TypeVar("T")
@@ -37,6 +37,8 @@ class Pair:
     stamp_ns: int
     colour: Path
     depth: Path
+    apart_ns: int = 0
+    """The depth image's stamp less the colour image's."""
 
 
 class TumSource:
@@ -50,6 +52,7 @@ class TumSource:
         self.name = str(folder)
         self._pairs = _pairs(folder, config)
         self.expected: int | None = len(self._pairs)
+        self.remark = _apart(self._pairs, round(config.associate_within_s * 1e9))
         self.intrinsics: Intrinsics = read_intrinsics(
             Path(config.camera_file) if config.camera_file else folder / "camera.json"
         )
@@ -100,7 +103,7 @@ def _pairs(folder: Path, config: CameraConfig) -> list[Pair]:
     listed = folder / "associations.txt"
     if listed.exists():
         rows = read_rows(listed, columns=4, what="'stamp colour stamp depth'")
-        pairs = [Pair(stamp_ns_of(r, 0, listed), folder / r.fields[1], folder / r.fields[3]) for r in rows]
+        pairs = [_listed(row, folder, listed) for row in rows]
     else:
         pairs = _associated(folder, config)
     if not pairs:
@@ -128,4 +131,27 @@ def _associated(folder: Path, config: CameraConfig) -> list[Pair]:
     matches = associate(colour_ns, depth_ns, within_ns)
     if not matches:
         raise InputError(f"{folder}: no frames: {unpaired(colour_ns, depth_ns, within_ns)}")
-    return [Pair(int(colour_ns[i]), folder / colour[i].fields[1], folder / depth[k].fields[1]) for i, k in matches]
+    return [
+        Pair(
+            int(colour_ns[i]), folder / colour[i].fields[1], folder / depth[k].fields[1], int(depth_ns[k] - colour_ns[i])
+        )
+        for i, k in matches
+    ]  # fmt: skip
+
+
+def _listed(row: Row, folder: Path, path: Path) -> Pair:
+    """Return a line of associations.txt."""
+    colour_ns, depth_ns = stamp_ns_of(row, 0, path), stamp_ns_of(row, 2, path)
+    return Pair(colour_ns, folder / row.fields[1], folder / row.fields[3], depth_ns - colour_ns)
+
+
+def _apart(pairs: list[Pair], within_ns: int) -> str:
+    """Return a remark on pairs whose stamps are too far apart to show one moment: a list may pair what it likes."""
+    apart_ns = int(np.median([pair.apart_ns for pair in pairs]))
+    far = sum(abs(pair.apart_ns) > within_ns for pair in pairs)
+    if not far:
+        return ""
+    return (
+        f"{far} of {len(pairs)} frames pair colour with depth of another time: depth is usually {apart_ns / 1e6:+.0f} ms "
+        f"off, at most {within_ns / 1e6:.0f} ms is one moment (camera.associate_within_s)"
+    )
