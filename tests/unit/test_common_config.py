@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.common.config import TreedockConfig
-from services.common.config_loader import known_keys, load, to_toml
+from services.common.config_loader import current, known_keys, load, to_toml
 from services.common.errors import InputError
 
 
@@ -123,3 +123,37 @@ def test_every_setting_is_reachable_by_a_variable() -> None:
     keys = known_keys()
     assert {"uav", "router.port", "refiner.noise.disparity_px", "detector.slicing.voxel_m"} <= set(keys)
     assert len({key.lower() for key in keys}) == len(keys)
+
+
+def test_a_file_from_the_future_is_refused_by_name(tmp_path: Path) -> None:
+    path = write(tmp_path, "a.toml", "config_version = 99\n")
+    with pytest.raises(InputError, match=r"a\.toml: config_version = 99.*newer treedock"):
+        load(path, environ={}, system_directory=tmp_path / "none")
+
+
+@pytest.mark.parametrize("version", ['"1"', "0", "-3", "true", "1.5"])
+def test_a_version_is_a_number(tmp_path: Path, version: str) -> None:
+    path = write(tmp_path, "a.toml", f"config_version = {version}\n")
+    with pytest.raises(InputError, match="config_version"):
+        load(path, environ={}, system_directory=tmp_path / "none")
+
+
+def test_old_files_are_read_through_every_step() -> None:
+    def renamed(body: dict[str, object]) -> dict[str, object]:
+        return {("new" if key == "old" else key): value for key, value in body.items()}
+
+    def doubled(body: dict[str, object]) -> dict[str, object]:
+        return {key: value * 2 if isinstance(value, int) else value for key, value in body.items()}
+
+    steps = {1: renamed, 2: doubled}
+    assert current({"config_version": 1, "old": 4}, "f", steps) == {"new": 8}
+    assert current({"config_version": 2, "new": 4}, "f", steps) == {"new": 8}
+    assert current({"config_version": 3, "new": 4}, "f", steps) == {"new": 4}
+    assert current({"new": 4}, "f", steps) == {"new": 4}, "no version: today's"
+    with pytest.raises(InputError, match="up to 3"):
+        current({"config_version": 4}, "f", steps)
+
+
+def test_this_version_is_read(tmp_path: Path) -> None:
+    path = write(tmp_path, "a.toml", 'config_version = 1\nuav = "kea"\n')
+    assert load(path, environ={}, system_directory=tmp_path / "none").config.uav == "kea"

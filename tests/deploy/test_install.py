@@ -1,0 +1,154 @@
+"""The installer stages what the units need, touches nothing in a dry run, and takes everything away again."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from schemas.topics import TOPICS
+from services.cli.service_command import SERVICES
+from services.common.config_loader import load
+from services.common.errors import InputError
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT / "deploy"))
+
+import installer  # noqa: E402 - lies beside the script that runs before anything is installed
+import units  # noqa: E402
+
+HAS_SYSTEMD = shutil.which("systemd-analyze") is not None
+
+
+def options(tmp_path: Path, *arguments: str) -> installer.Options:
+    return installer.parse(["--root", str(tmp_path), *arguments])[1]
+
+
+def staged(tmp_path: Path, *arguments: str) -> None:
+    """Everything but the environment, which takes minutes and a package index."""
+    for action in installer.installation(options(tmp_path, *arguments)):
+        if not isinstance(action, installer.Run):
+            action.do()
+
+
+def test_the_unit_files_are_the_tables() -> None:
+    written = {path.name: path.read_text() for path in (ROOT / "deploy/systemd").iterdir()}
+    assert written == units.files(), "run: python deploy/units.py"
+
+
+def test_there_is_a_unit_for_every_service_and_only_for_those() -> None:
+    assert {unit.name for unit in units.UNITS} == {*SERVICES, "station"} - {"simulator"}
+
+
+def test_autopilot_and_slam_come_first_when_the_processor_is_short() -> None:
+    first, second, *rest = sorted(units.UNITS, key=lambda unit: -unit.cpu_weight)
+    assert {first.name, second.name} == {"autopilot", "slam"}
+    assert all(unit.cpu_weight <= second.cpu_weight for unit in rest)
+    assert {t.producer for t in TOPICS} >= {"slam"}
+
+
+@pytest.mark.parametrize("unit", units.UNITS, ids=lambda unit: unit.name)
+def test_every_unit_is_supervised_as_decided(unit: units.Unit) -> None:
+    text = units.service_text(unit)
+    for line in ("Type=notify", "WatchdogSec=5", "Restart=always", "RestartSec=500ms", "StartLimitIntervalSec=0",
+                 "TimeoutStopSec=3", "User=treedock", "LimitMEMLOCK=infinity", "ProtectSystem=strict"):  # fmt: skip
+        assert f"\n{line}\n" in text
+    assert ("DeviceAllow=" in text) == (unit.name in {"camera", "autopilot"}), "devices only where needed"
+    assert ("MemoryDenyWriteExecute" in text) != unit.compiles
+
+
+@pytest.mark.skipif(not HAS_SYSTEMD, reason="systemd-analyze is not installed")
+@pytest.mark.parametrize("unit", units.UNITS, ids=lambda unit: unit.name)
+def test_exposure_is_at_most_two(unit: units.Unit, tmp_path: Path) -> None:
+    path = tmp_path / f"treedock-{unit.name}.service"
+    path.write_text(units.service_text(unit))
+    command = ["systemd-analyze", "security", "--offline=yes", "--threshold=20", "--no-pager", str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-400:]
+
+
+@pytest.mark.skipif(not HAS_SYSTEMD, reason="systemd-analyze is not installed")
+def test_systemd_verifies_the_units(tmp_path: Path) -> None:
+    binary = tmp_path / "opt/bin/treedock"
+    binary.parent.mkdir(parents=True)
+    binary.write_text("#!/bin/sh\n")
+    binary.chmod(0o755)
+    for name, text in units.files(str(tmp_path / "opt")).items():
+        (tmp_path / name).write_text(text)
+    paths = [str(path) for path in sorted(tmp_path.glob("treedock*"))]
+    done = subprocess.run(["systemd-analyze", "verify", *paths], capture_output=True, text=True, check=False)
+    ours = [line for line in done.stderr.splitlines() if "treedock" in line and "Documentation" not in line]
+    assert ours == []
+    assert done.returncode == 0
+
+
+def test_a_staged_installation_is_complete_and_its_configuration_is_read(tmp_path: Path) -> None:
+    staged(tmp_path, "--uav", "kea-2")
+    assert set(units.files()) == {path.name for path in (tmp_path / "etc/systemd/system").iterdir()}
+    assert (tmp_path / "etc/udev/rules.d/60-treedock.rules").is_file()
+    assert oct((tmp_path / "etc/treedock/certs").stat().st_mode)[-3:] == "700"
+    found = load(environ={}, system_directory=tmp_path / "etc/treedock").config
+    assert found.uav == "kea-2"
+    assert found.router.listen_host == "127.0.0.1"
+
+
+def test_the_commented_settings_are_real_ones(tmp_path: Path) -> None:
+    text = (ROOT / "deploy/etc/10-treedock.toml").read_text().replace("@UAV@", "uav1")
+    lines = [
+        line.removeprefix("# ") if line.startswith(("# [", "# ")) and ("=" in line or "# [" in line) else line
+        for line in text.splitlines()
+    ]
+    body = "\n".join(line for line in lines if not line.startswith("#"))
+    path = tmp_path / "all.toml"
+    path.write_text(body + "\n[router2]\nx = 1\n")
+    assert tomllib.loads(body)["security"]["folder"] == "/etc/treedock/certs"
+    with pytest.raises(InputError, match="router2"):
+        load(path, environ={}, system_directory=tmp_path / "none")
+
+
+def test_again_changes_nothing_and_keeps_the_administrators_file(tmp_path: Path) -> None:
+    staged(tmp_path)
+    own = tmp_path / "etc/treedock/10-treedock.toml"
+    own.write_text('uav = "mine"\n')
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
+    staged(tmp_path, "--uav", "other")
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()} == before
+    assert own.read_text() == 'uav = "mine"\n'
+
+
+def test_another_prefix_reaches_the_units(tmp_path: Path) -> None:
+    staged(tmp_path, "--prefix", "/usr/local/treedock")
+    text = (tmp_path / "etc/systemd/system/treedock-slam.service").read_text()
+    assert "ExecStart=/usr/local/treedock/bin/treedock slam" in text
+
+
+def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert installer.main(["--root", str(tmp_path / "new"), "--dry-run"]) == 0
+    assert not (tmp_path / "new").exists()
+    out = capsys.readouterr().out
+    assert "treedock-slam.service" in out
+    assert "pip install" in out
+
+
+def test_uninstall_leaves_configuration_and_data_unless_purged(tmp_path: Path) -> None:
+    staged(tmp_path)
+    (tmp_path / "opt/treedock/bin").mkdir(parents=True)
+    assert installer.main(["uninstall", "--root", str(tmp_path)]) == 0
+    assert not (tmp_path / "opt/treedock").exists()
+    assert list((tmp_path / "etc/systemd/system").iterdir()) == []
+    assert (tmp_path / "etc/treedock/10-treedock.toml").exists()
+    assert installer.main(["uninstall", "--purge", "--root", str(tmp_path)]) == 0
+    assert not (tmp_path / "etc/treedock").exists()
+
+
+@pytest.mark.parametrize("arguments", [["--uav", "a b"], ["--uav", ""], ["--prefix", "opt"], ["--uav", "x/../y"]])
+def test_what_cannot_work_is_refused_first(
+    tmp_path: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert installer.main(["--root", str(tmp_path / "r"), *arguments]) == 2
+    assert not (tmp_path / "r").exists()
+    assert capsys.readouterr().err.startswith("deploy/install: --")
