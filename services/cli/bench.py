@@ -48,7 +48,7 @@ def bench(
     run = load_bench(name)
     options = BenchOptions(
         seed=seed, out=out, scenes=tuple(part.strip() for part in scenes.split(",") if part.strip()), quick=quick,
-        keep_sequences=keep_sequences, count=count, rendered=rendered,
+        keep_sequences=keep_sequences, count=count, doc=doc, rendered=rendered,
         tell=lambda line: typer.echo(line, err=True), **({"data": data} if data is not None else {}),
     )  # fmt: skip
     report = run(options)

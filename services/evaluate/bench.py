@@ -23,6 +23,7 @@ BENCHES: dict[str, str] = {
     "latency": "services.evaluate.bench_latency",
     "depth": "services.evaluate.bench_depth",
     "missions": "services.evaluate.bench_missions",
+    "avoid": "services.evaluate.bench_avoid",
     "system": "services.evaluate.bench_system",
     "station": "services.evaluate.bench_station",
     "faults": "services.evaluate.bench_faults",
@@ -48,6 +49,8 @@ class BenchOptions:
     """With rendered images and real processes, where a benchmark can do without (missions)."""
     quick: bool = False
     """Less data, for a look; figures then say less."""
+    doc: Path | None = None
+    """The Markdown file that will show the result: pictures go into ``images`` beside it, else into ``out``."""
     keep_sequences: bool = False
     """Keep what was rendered, for the next call with the same simulator (150 MB a scene)."""
     tell: Callable[[str], None] = lambda _: None

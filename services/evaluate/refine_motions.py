@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from services.common.geometry import R_BODY_CAMERA, Matrix, exp_rotation, pose, 
 from services.detector.refine.config import RefinerConfig
 from services.detector.refine.model import ExpectedTree
 from services.detector.refine.tracker import RefinerTracker
+from services.detector.refine.view import axis_point, project_point
+from services.simulator.render import DEFAULT_INTRINSICS
 
 RATE_HZ = 15.0
 DURATION_S = 8.0
@@ -33,6 +36,12 @@ class MotionRow:
     """NaN where the frame was not measured."""
     filtered: Matrix
     """NaN where the target was lost."""
+    sigma: Matrix
+    """Of ``filtered``, as told."""
+    mapped: Matrix
+    """What the map alone says."""
+    nis: Matrix
+    """Normalised squared innovations of the filters, NaN where none was accepted."""
     status: tuple[str, ...]
 
     def figures(self) -> dict[str, float]:
@@ -43,6 +52,9 @@ class MotionRow:
                 error = values[:, k] - self.true[:, k]
                 out[f"{self.name}_{what}_{kind}_rmse_{unit}"] = float(np.sqrt(np.nanmean(error**2)))
                 out[f"{self.name}_{what}_{kind}_jitter_{unit}"] = float(np.nanstd(np.diff(error)))
+            error = (self.filtered[:, k] - self.true[:, k]) / self.sigma[:, k]
+            out[f"{self.name}_{what}_nees"] = float(np.nanmean(error**2))
+            out[f"{self.name}_{what}_nis"] = float(np.nanmean(self.nis[:, k]))
         if self.name == "hidden":
             out |= self._hidden_figures()
         return out
@@ -51,7 +63,9 @@ class MotionRow:
         after = [t for t, s in zip(self.t_s, self.status, strict=True) if t > HIDDEN_S[0] and s == "lost"]
         lost_s = min(after) - HIDDEN_S[0] if after else math.nan
         found = self.t_s[(self.t_s > HIDDEN_S[1]) & ~np.isnan(self.raw[:, 0])]
-        return {"lost_after_s": lost_s, "found_after_s": float(found.min() - HIDDEN_S[1]) if len(found) else math.nan}
+        found_s = float(found.min()) - HIDDEN_S[1] if len(found) else math.nan
+        figures = {"lost_after_s": float(lost_s), "found_after_s": found_s}
+        return {name: value for name, value in figures.items() if math.isfinite(value)}
 
     def line(self) -> str:
         """Return the row as one line."""
@@ -64,7 +78,8 @@ class MotionRow:
             f"measured {int(np.sum(~np.isnan(self.raw[:, 0])))} of {len(self.t_s)}"
         )
         if n == "hidden":
-            text += f"; said lost after {f['lost_after_s']:.2f} s, found {f['found_after_s']:.2f} s after it was free"
+            said, found = (f"{f[k]:.2f} s" if k in f else "never" for k in ("lost_after_s", "found_after_s"))
+            text += f"; said lost after {said}, found after {found} of being free"
         return text
 
 
@@ -101,7 +116,6 @@ def _motion(name: str, seed: int, share: float) -> MotionRow:
     from services.simulator.camera import SimulatedCamera
     from services.simulator.catalogue import random_scene
     from services.simulator.config import SensorConfig
-    from services.simulator.render import DEFAULT_INTRINSICS
     from services.simulator.world import World
 
     scene = random_scene(77_000 + seed, "single")
@@ -112,7 +126,8 @@ def _motion(name: str, seed: int, share: float) -> MotionRow:
     tracker = RefinerTracker(RefinerConfig())
     tracker.set_trees([told], [0], "bench", 0)
     heading = math.atan2(tree.y_m, tree.x_m)
-    rows: list[tuple[float, list[float], list[float], list[float], str]] = []
+    rows: list[tuple[float | tuple[float, ...], ...]] = []
+    status: list[str] = []
     for k in range(int(DURATION_S * RATE_HZ * (share if name != "hidden" else 1.0))):
         t = k / RATE_HZ
         T = _camera(tree.centre_at(1.5)[:2], heading, MOTIONS[name](t), scene.ground.at(0.0, 0.0))
@@ -122,16 +137,31 @@ def _motion(name: str, seed: int, share: float) -> MotionRow:
         error = rng.normal(0.0, _JITTER)
         jittered = pose(exp_rotation(error[3:]) @ T[:3, :3], T[:3, 3] + error[:3])
         state = tracker.step(round(t * 1e9), depth, DEFAULT_INTRINSICS, jittered, np.diag(np.square(_JITTER)) * 4.0)
-        offset = np.append(tree.centre_at(float(T[2, 3]) - tree.z_m)[:2] - T[:2, 3], 0.0)
-        p = offset @ T[:3, :3]
-        i = DEFAULT_INTRINSICS
-        true = [i.fx * p[0] / p[2] + i.cx, float(np.hypot(offset[0], offset[1])), tree.radius_m]
-        raw = [state.raw_image_x_px, state.raw_range_m, state.raw_radius_m]
-        filtered = [state.image_x_px, state.range_m, state.radius_m]
-        nan = [[math.nan if v is None else v for v in values] for values in (raw, filtered)]
-        rows.append((t, true, nan[0], nan[1], state.status))
-    t_s, true_v, raw_v, filtered_v = (np.array([row[j] for row in rows], dtype=np.float64) for j in range(4))
-    return MotionRow(name, t_s, true_v, raw_v, filtered_v, tuple(row[4] for row in rows))
+        at = float(T[2, 3]) - tree.z_m
+        true = _as_seen(tree.centre_at(at)[:2], T, tree.radius_m)
+        mapped = _as_seen(axis_point(told, float(jittered[2, 3])), jittered, told.radius_m)
+        raw = _numbers(state.raw_image_x_px, state.raw_range_m, state.raw_radius_m)
+        filtered = _numbers(state.image_x_px, state.range_m, state.radius_m)
+        sigma = _numbers(state.sigma_bearing_rad, state.sigma_range_m, state.sigma_radius_m)
+        sigma = (sigma[0] * DEFAULT_INTRINSICS.fx, *sigma[1:])
+        nis = _numbers(*(tracker.innovations2 or (None,) * 3)) if state.measured else _numbers(None, None, None)
+        rows.append((t, true, raw, filtered, sigma, mapped, nis))
+        status.append(state.status)
+    t_s, true_v, raw_v, filtered_v, sigma_v, mapped_v, nis_v = (
+        np.array([row[j] for row in rows], dtype=np.float64) for j in range(7)
+    )
+    return MotionRow(name, t_s, true_v, raw_v, filtered_v, sigma_v, mapped_v, nis_v, tuple(status))
+
+
+def _as_seen(place_m: Matrix, T: Matrix, radius_m: float) -> tuple[float, float, float]:
+    """Return image x (px), range (m) and radius of a trunk at ``place_m`` (2,) in map."""
+    offset = place_m - T[:2, 3]
+    x, y, z = (offset @ T[:2, :3]).tolist()
+    return project_point(x, y, z, DEFAULT_INTRINSICS)[0], float(np.hypot(offset[0], offset[1])), radius_m
+
+
+def _numbers(*values: float | None) -> tuple[float, ...]:
+    return tuple(math.nan if value is None else float(value) for value in values)
 
 
 def _camera(place_m: Matrix, heading: float, moved: tuple[float, float, float], ground_m: float) -> Matrix:
@@ -143,19 +173,39 @@ def _camera(place_m: Matrix, heading: float, moved: tuple[float, float, float], 
 
 
 def plot_motions(rows: Sequence[MotionRow], path: Path) -> str:
-    """Draw true, raw and filtered values over time; return the file's name, or why there is none."""
+    """Draw the motions, and what of them the raw and the filtered values miss; return the file's name, or why not."""
     try:
         from matplotlib.figure import Figure
     except ImportError:
         return "none: matplotlib is not installed"
-    figure = Figure(figsize=(15, 3.2 * len(rows)), layout="constrained")
-    axes = figure.subplots(len(rows), 3, squeeze=False)
+    figure = Figure(figsize=(15, 2.7 * len(rows)), layout="constrained")
+    axes = figure.subplots(len(rows), 4, squeeze=False, sharex="row")
     for row, line in zip(rows, axes, strict=True):
-        for k, what in enumerate(("image x (px)", "range (m)", "radius (m)")):
-            line[k].plot(row.t_s, row.true[:, k], "k-", linewidth=0.8, label="true")
-            line[k].plot(row.t_s, row.raw[:, k], "r.", markersize=3, label="raw")
-            line[k].plot(row.t_s, row.filtered[:, k], "b-", linewidth=1.0, label="filtered")
-            line[k].set(title=f"{row.name.replace('_', ' ')}: {what}", xlabel="s")
-        line[0].legend()
-    figure.savefig(path, dpi=80)
+        name = row.name.replace("_", " / ")
+        line[0].plot(row.t_s, row.true[:, 0], color="black", linewidth=2.5, alpha=0.3, label="true")
+        line[0].plot(row.t_s, row.raw[:, 0], ".", color="tab:red", markersize=3, label="raw")
+        line[0].plot(row.t_s, row.filtered[:, 0], color="tab:blue", linewidth=1.0, label="filtered")
+        line[0].set_title(f"{name}: image x (px)", fontsize=10)
+        for k, (what, scale) in enumerate((("image x (px)", 1.0), ("range (mm)", 1e3), ("radius (mm)", 1e3))):
+            _plot_error(line[k + 1], row, k, scale)
+            line[k + 1].set_title(f"{name}: error of {what}", fontsize=10)
+    for panel in axes[-1]:
+        panel.set_xlabel("s")
+    axes[0][0].legend(fontsize=8, loc="best")
+    axes[0][2].legend(fontsize=8, loc="best")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=72)
     return path.name
+
+
+def _plot_error(panel: Any, row: MotionRow, k: int, scale: float) -> None:  # noqa: ANN401 - matplotlib
+    """Draw raw and filtered less true, the filter's own two sigma about zero, and the map's word where it is in reach."""
+    sigma, mapped = 2.0 * scale * row.sigma[:, k], scale * (row.mapped[:, k] - row.true[:, k])
+    raw, filtered = (scale * (values[:, k] - row.true[:, k]) for values in (row.raw, row.filtered))
+    panel.fill_between(row.t_s, -sigma, sigma, color="tab:blue", alpha=0.12, linewidth=0, label="2 sigma as told")
+    panel.plot(row.t_s, mapped, color="tab:green", linewidth=0.8, alpha=0.8, label="map (cloud)")
+    panel.plot(row.t_s, raw, ".", color="tab:red", markersize=3, label="raw")
+    panel.plot(row.t_s, filtered, color="tab:blue", linewidth=1.0, label="filtered")
+    panel.axhline(0.0, color="black", linewidth=0.5)
+    reach = 1.3 * float(np.nanmax([np.nanmax(np.abs(raw)), np.nanmax(sigma)]))
+    panel.set_ylim(-reach, reach)

@@ -37,6 +37,7 @@ class View:
     tree: int
     distance_m: float
     depth: NDArray[np.uint16]
+    colour: NDArray[np.uint8]
     T_true: Matrix
     T_told: Matrix
     pose_covariance: Matrix
@@ -69,9 +70,9 @@ def views(scene_name: str, seed: int) -> Iterator[View]:
                 continue
             told, common = _wrong_pose(T, rng)
             trees = [_mapped(k, other, rng) for k, other in enumerate(scene.trees)]
-            depth = camera.look(T, 100 * index + number).depth.copy()
+            images = camera.look(T, 100 * index + number)
             yield View(
-                scene_name, index, distance, depth, T, told, common, trees[index],
+                scene_name, index, distance, images.depth.copy(), images.colour.copy(), T, told, common, trees[index],
                 tuple(t for t in trees if t.id != index), tree.centre_at(float(T[2, 3]) - tree.z_m)[:2],
                 tree.radius_m, _axis_at(trees[index], float(told[2, 3])),
             )  # fmt: skip

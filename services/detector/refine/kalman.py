@@ -67,6 +67,9 @@ class TargetFilter:
         self._filters = [Filter1D(*arguments) for arguments in zip(values, variances, rates, strict=True)]
         self._refused = 0
         self._constant = tuple((1.0 - config.white_share) * v for v in variances)
+        self.innovations2 = (0.0, 0.0, 0.0)
+        """Squares of the last accepted innovations over their predicted variance (NIS): near 1 on average when the noise
+        is as told."""
 
     @property
     def values(self) -> tuple[float, float, float]:
@@ -102,6 +105,8 @@ class TargetFilter:
             return False
         self._refused = 0
         share = self._config.white_share
+        x, distance, radius = (f.surprise(value, variance * share) ** 2 for f, value, variance in triples)
+        self.innovations2 = (x, distance, radius)
         for f, value, variance in triples:
             f.update(value, variance * share)
         self._constant = tuple((1.0 - share) * v for v in variances)

@@ -54,6 +54,11 @@ class RefinerTracker:
         return self._agreement.fault
 
     @property
+    def innovations2(self) -> tuple[float, float, float] | None:
+        """Return the filters' last normalised squared innovations (image x, range, radius), None without filters."""
+        return self._filter.innovations2 if self._filter else None
+
+    @property
     def map_id(self) -> str:
         """Return the map that the known trees belong to, empty when there is none."""
         return self._map_id
