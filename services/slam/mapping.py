@@ -25,6 +25,9 @@ I32 = NDArray[np.int32]
 
 _COMPILED_KEYFRAMES = 24
 """Above this the cameras' system is large enough to pay for LAPACK."""
+_REDUNDANT = 0.9
+_BEHIND, _REDUNDANT_BEHIND = 60, 0.6
+"""A keyframe goes whose points three others see to such a share; and to this, once so many younger ones live."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +90,7 @@ class Mapping:
         with self.step():
             self.far.learn(atlas.points, atlas.keyframes, self.camera.array[0])
         self._cull_keyframes(k)
+        self._thin()
 
     def _create(self, k: int) -> None:
         atlas, config = self.atlas, self.config
@@ -223,8 +227,21 @@ class Mapping:
                 kf = atlas.keyframes
                 if kf.serial[other] == 0 or kf.serial[other] >= kf.serial[k] - 1:
                     continue
-                if redundancy(atlas.points, kf, int(other)) > 0.9:
+                if redundancy(atlas.points, kf, int(other)) > _REDUNDANT:
                     self.retire(int(other))
+
+    def _thin(self) -> None:
+        """Look once at each keyframe when it has fallen far behind: there a thinner map will do."""
+        with self.step():
+            slots = self.atlas.slots
+            if len(slots) <= _BEHIND:
+                return
+            old = int(slots[-_BEHIND])
+            if (
+                self.atlas.keyframes.serial[old]
+                and redundancy(self.atlas.points, self.atlas.keyframes, old) > _REDUNDANT_BEHIND
+            ):
+                self.retire(old)
 
     def retire(self, k: int) -> None:
         """Take a keyframe out of the map, remembering where it stood relative to its nearest relative."""

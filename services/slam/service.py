@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.camera import Intrinsics, RgbdFrame
-from schemas.slam import Graph, GraphNode, Keyframe, Pose, Transform
+from schemas.slam import Graph, Keyframe
 from schemas.topics import CAMERA_COMPRESSED, CAMERA_RGBD, SLAM_GRAPH, SLAM_KEYFRAME, SLAM_POSE, VEHICLE_STATE
 from schemas.vehicle import VehicleState
 from services.camera.codecs import FrameError, decode_colour, decode_depth_raw, recode
@@ -15,6 +15,7 @@ from services.common.geometry import R_BODY_CAMERA, Matrix, rotation_from_quater
 from services.slam.config import SlamConfig
 from services.slam.keeper import state_folder
 from services.slam.maps import LiveMaps, LockstepMap, Maps
+from services.slam.messages import Nodes, pose_message
 from services.slam.results import GraphUpdate, TrackResult
 from services.slam.slam import Slam
 from services.slam.warm import warm
@@ -53,6 +54,7 @@ class SlamService:
         self._context = context
         self._config = config
         self._maps = maps
+        self._nodes = Nodes()
         self._intrinsics: Intrinsics | None = None
         self._up_body: tuple[int, Matrix] | None = None
         self._last_stamp_ns = -1
@@ -140,23 +142,32 @@ class SlamService:
         return self._up_body[1]
 
     def _publish(self, frame: RgbdFrame, result: TrackResult) -> None:
-        if result.new_keyframes:
-            coded = recode(frame, "jpeg", "zstd", _JPEG_QUALITY)
-            for new in result.new_keyframes:
-                self._context.publish(SLAM_KEYFRAME, Keyframe(
-                    keyframe_id=new.keyframe_id, stamp_ns=frame.stamp_ns, map_id=self._map_id,
-                    graph_version=result.graph_version, T_map_camera=to_transform(new.T_map_camera),
-                    intrinsics=frame.intrinsics, depth_encoding="zstd", depth=bytes(coded.depth),
-                    colour_jpeg=bytes(coded.colour),
-                ))  # fmt: skip
-            self._context.health.count("keyframes", len(result.new_keyframes))
+        """In lockstep what the pose rests on goes first; live the pose does not wait for a keyframe's compression."""
+        pose = pose_message(frame, result, self._map_id, self._processing_ms())
+        if not self._context.lockstep:
+            self._context.publish(SLAM_POSE, pose)
+        self._publish_keyframes(frame, result)
         if result.graph is not None:
             self._publish_graph(frame.stamp_ns, result.graph)
-        self._context.publish(SLAM_POSE, pose_message(frame, result, self._map_id, self._processing_ms()))
+        if self._context.lockstep:
+            self._context.publish(SLAM_POSE, pose)
+
+    def _publish_keyframes(self, frame: RgbdFrame, result: TrackResult) -> None:
+        if not result.new_keyframes:
+            return
+        coded = recode(frame, "jpeg", "zstd", _JPEG_QUALITY)
+        for new in result.new_keyframes:
+            self._context.publish(SLAM_KEYFRAME, Keyframe(
+                keyframe_id=new.keyframe_id, stamp_ns=frame.stamp_ns, map_id=self._map_id,
+                graph_version=result.graph_version, T_map_camera=to_transform(new.T_map_camera),
+                intrinsics=frame.intrinsics, depth_encoding="zstd", depth=bytes(coded.depth),
+                colour_jpeg=bytes(coded.colour),
+            ))  # fmt: skip
+        self._context.health.count("keyframes", len(result.new_keyframes))
 
     def _publish_graph(self, stamp_ns: int, graph: GraphUpdate) -> None:
         assert self.slam is not None
-        nodes = tuple(GraphNode(keyframe_id=i, T_map_camera=to_transform(T)) for i, T in graph.nodes)
+        nodes = self._nodes.of(graph)
         self._context.publish(SLAM_GRAPH, Graph(
             stamp_ns=stamp_ns, map_id=self._map_id, version=graph.version, reset_counter=self.slam.reset_counter,
             reason=graph.reason, nodes=nodes, up_sigma_rad=self.slam.up_sigma_rad,
@@ -170,20 +181,3 @@ class SlamService:
 
     def _processing_ms(self) -> float:
         return self._context.health.stage_ms["track"][-1]
-
-
-def pose_message(frame: RgbdFrame, result: TrackResult, map_id: str, processing_ms: float) -> Pose:
-    """Return the message of one frame's result."""
-    relative: Transform | None = None
-    if result.T_keyframe_camera is not None:
-        relative = to_transform(result.T_keyframe_camera)
-    covariance = None
-    if result.covariance is not None:
-        covariance = tuple(float(c) for c in result.covariance[np.triu_indices(6)])
-    return Pose(
-        stamp_ns=frame.stamp_ns, seq=frame.seq, map_id=map_id, status=result.status,
-        T_map_camera=None if result.T_map_camera is None else to_transform(result.T_map_camera),
-        covariance=covariance, reset_counter=result.reset_counter, graph_version=result.graph_version,
-        keyframe_id=result.keyframe_id, T_keyframe_camera=relative, inliers=result.inliers,
-        up_sigma_rad=result.up_sigma_rad, processing_ms=processing_ms,
-    )  # fmt: skip
