@@ -21,6 +21,7 @@ from services.slam.atlas import Atlas
 from services.slam.camera import camera_model
 from services.slam.config import SlamConfig
 from services.slam.features import Extractor, Features
+from services.slam.keyframing import KeyframeRule
 from services.slam.links import shared_counts
 from services.slam.loops import Loops
 from services.slam.mapping import Mapping
@@ -37,8 +38,6 @@ _MIN_START_POINTS = 100
 _JUMP_M = 0.01
 _JUMP_RAD = 0.005
 """A loop that moves the camera by more is told as a jump."""
-_BACKLOG = 2
-"""With so many keyframes waiting for mapping a frame that is only less well seen makes no other."""
 
 
 class Slam:
@@ -74,8 +73,7 @@ class Slam:
         self._reference = -1
         self._anchor: F64 = np.eye(4)
         """T_keyframe_camera of the last tracked frame."""
-        self._peak = 0
-        """Most inliers of a frame since the last keyframe."""
+        self._rule = KeyframeRule(config)
         self._trail = Trail() if keep_trail else None
         self._revision = 0
         """Of the mapping's corrections, the last one taken over; and of its loops."""
@@ -209,7 +207,7 @@ class Slam:
         if self._last is not None:
             self._step = pose(frame.R, frame.t) @ inverse(pose(self._last.R, self._last.t))
         new: list[NewKeyframe] = []
-        if self._needs_keyframe(frame):
+        if self.graph_version == 0 or self._rule.wants(frame, self.crew.waiting):
             new, graph = self._make_keyframe(frame, graph)
         self._set_anchor(frame)
         self._last = frame
@@ -227,7 +225,7 @@ class Slam:
         self._tell_jump(*moved(frame.R, frame.t, kf.R[k], kf.t[k]))
         frame.R, frame.t = kf.R[k].copy(), kf.t[k].copy()
         frame.point = kf.point[k, : len(frame.features)].copy()
-        self._peak = 0
+        self._rule.made()
         if settled:
             graph = self._corrected()
         else:
@@ -263,21 +261,6 @@ class Slam:
         k = int(np.lexsort((-kf.serial, -counts))[0])
         self._reference = int(kf.serial[k])
         self._anchor = pose(kf.R[k], kf.t[k]) @ inverse(pose(frame.R, frame.t))
-
-    def _needs_keyframe(self, frame: Tracked) -> bool:
-        if self.graph_version == 0:
-            return True
-        config = self.config
-        f = frame.features
-        close = (f.depth >= config.min_depth_m) & (f.depth <= config.max_depth_m)
-        tracked = int(np.count_nonzero(close & (frame.point >= 0)))
-        untracked = int(np.count_nonzero(close & (frame.point < 0)))
-        if tracked < config.close_tracked_min and untracked > config.close_untracked_max:
-            return True
-        self._peak = max(self._peak, frame.inliers)
-        if self.crew.waiting >= _BACKLOG:
-            return False
-        return frame.inliers < config.keyframe_ratio * self._peak
 
     def polish(self) -> GraphUpdate | None:
         """Adjust the whole map once, when there is time for it; return the new graph, None when there is none (yet)."""
