@@ -66,7 +66,7 @@ def test_a_bad_set_is_refused_with_3_and_writes_no_camera(
     few = [str(path) for path in sorted(folder.iterdir())[:6]]
     assert invoke(["calibrate", *few, "--out", str(out)]) == 3
     last = capsys.readouterr().err.strip().splitlines()[-1]
-    assert last.startswith("treedock: no calibration: only 6 of 6 pictures can be used, 10 are needed")
+    assert last.startswith("treedock: no calibration: only 6 of 6 pictures can be used, 8 are needed")
     assert not out.exists()
 
 

@@ -94,7 +94,7 @@ def test_a_blurred_set_is_a_clear_no() -> None:
 def test_too_few_pictures_are_a_clear_no(looked: list[Picture]) -> None:
     result = calibrate(looked[:5], CHECKER, SIZE, LIMITS)
     assert not result.passed
-    assert result.faults[0] == "only 5 of 5 pictures can be used, 10 are needed: take more"
+    assert result.faults[0] == "only 5 of 5 pictures can be used, 8 are needed: take more"
     assert not judged([]).passed
 
 
@@ -149,7 +149,7 @@ def test_hints_lead_to_a_set_that_passes(looked: list[Picture]) -> None:
             break
     assert collector.hints() == []
     result = calibrate([Picture("", "", s) for s in collector.sightings], CHECKER, SIZE, LIMITS)
-    assert result.coverage.covered >= 0.6
+    assert result.coverage.covered >= 0.5
 
 
 def test_tilts_are_told_apart() -> None:

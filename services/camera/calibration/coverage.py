@@ -25,8 +25,8 @@ _GUESSED_FOCAL = 0.9
 class Needs:
     """What a set of pictures must have."""
 
-    views: int = 10
-    covered: float = 0.6
+    views: int = 8
+    covered: float = 0.5
     """Share of the picture's cells in which a corner was seen."""
     tilted: int = 3
     """Pictures turned left or right, and pictures tipped up or down, by at least ``tilt_rad``."""

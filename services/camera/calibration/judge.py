@@ -23,7 +23,7 @@ class Limits:
     edge_px: float = 4.0
     """Width of a board's edge in a sharp picture."""
     rms_px: float = 0.3
-    focal_sigma: float = 0.0015
+    focal_sigma: float = 0.0025
     """Standard deviation of the focal lengths, relative."""
     centre_share: float = 0.15
     """Largest distance of the principal point from the picture's middle, in picture widths."""
