@@ -113,7 +113,6 @@ Group=treedock
 WorkingDirectory=/var/lib/treedock
 StateDirectory={unit.state}
 CacheDirectory=treedock
-ConfigurationDirectory=treedock
 # READY comes after the bus is joined and the kernels are loaded; on a machine whose cache is cold that takes minutes
 TimeoutStartSec=300
 # kicked from the work loop once a second: a hung handler is a hung service
