@@ -134,6 +134,7 @@ def measure(recording: Path, speed: float) -> Passages:
     Raises:
         InputError: the recording cannot be used, or a service ended or was not ready in time.
     """
+    from services.camera.sources import open_source
     from services.common.bus import Bus
     from services.common.context import HealthBook
     from services.common.session import free_port, opened_client
@@ -143,6 +144,7 @@ def measure(recording: Path, speed: float) -> Passages:
         "camera": base.camera.model_copy(update={"source": f"tum:{recording.resolve()}", "rate": speed}),
         "router": base.router.model_copy(update={"port": free_port(base.router.host)}),
     })  # fmt: skip
+    open_source(config.camera.source, config.camera)  # finds its faults half a minute before the camera service would
     seen = Passages()
     with tempfile.TemporaryDirectory(prefix="treedock-latency-") as folder, _Processes(config, Path(folder)) as running:
         running.start("router")
