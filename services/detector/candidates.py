@@ -6,9 +6,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from services.detector.checks import axis_at, base_point, prolonged_top_m, shape_fault, space_above_was_seen
+from services.detector.checks import (
+    axis_at,
+    base_point,
+    prolonged_top_m,
+    seen_from_eye,
+    shape_fault,
+    space_above_was_seen,
+)
 from services.detector.config import DetectorConfig
-from services.detector.cylinders import Cylinder, fit_cylinder
+from services.detector.cylinders import Cylinder, fit_cylinder, fit_from
+from services.detector.facing import LONGEST_M, common_eye
 from services.detector.forks import Arm, Fork, find_forks
 from services.detector.halves import both_halves
 from services.detector.model import Floats, Ground, Rejection, Trunk, Views
@@ -17,6 +25,7 @@ from services.detector.upright import Floats32, Upright
 from services.detector.voxels import Voxels
 
 BREAST_HEIGHT_M = 1.3
+_EYE_HEIGHT_M = 1.4
 _NO_CYLINDER = "no cylinder through its slices"
 _ARM_LAYERS = 5
 """Slices that show a fork's second arm, though no cylinder could be fitted to it (the first stands in the way)."""
@@ -35,6 +44,8 @@ class Surroundings:
     span_m: float
     """Height over which a trunk must be seen."""
     config: DetectorConfig
+    eye_m: Floats | None = None
+    """(3,) upright frame: from where all was seen, where that is inferred."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +66,10 @@ def judge(stacks: list[Stack], around: Surroundings) -> tuple[list[Trunk], list[
     kept: list[Candidate] = []
     rejections: list[Rejection] = []
     unsure: list[Arm] = []
-    for stack, cylinder in zip(stacks, _fits(stacks, around), strict=True):
+    fits = _fits(stacks, around)
+    if not around.voxels.seen_from:
+        around = _look_again(stacks, fits, around)
+    for stack, cylinder in zip(stacks, fits, strict=True):
         found = _examine(stack, cylinder, kept, around)
         if isinstance(found, Rejection):
             rejections.append(found)
@@ -80,6 +94,46 @@ def _fits(stacks: list[Stack], around: Surroundings) -> list[Cylinder | None]:
 
     both_halves(work, 20_000 * (len(stacks) - 1))
     return fits
+
+
+def _look_again(stacks: list[Stack], fits: list[Cylinder | None], around: Surroundings) -> Surroundings:
+    """Fit what was no trunk once more as seen from the place that the trunks found look at, where there is one.
+
+    A thin trunk in noise does not tell by itself which side shows. Where none does, and nothing else is a trunk, the
+    origin of coordinates is tried: there a map begins.
+    """
+    told = [(c, c.told_ray) for c in fits if c is not None and c.told_ray is not None]
+    good = sum(c is not None and not _fault(c, around) for c in fits)
+    if 2 * len(told) < good:
+        return around  # most trunks show all sides: a scan from several places
+    if told:
+        eye = common_eye(
+            np.array([c.at_m[:2] for c, _ in told]), np.array([ray for _, ray in told]), np.array([c.range_m for c, _ in told])
+        )  # fmt: skip
+    else:
+        eye = around.frame.from_input(np.zeros(3))[:2] if good == 0 and _origin_inside(around.frame) else None
+    if eye is None:
+        return around
+    for k, (stack, cylinder) in enumerate(zip(stacks, fits, strict=True)):
+        near = float(np.hypot(*(stack.at_m[:2] - eye))) < LONGEST_M
+        if not near or (cylinder is not None and (cylinder.told_ray is not None or not _fault(cylinder, around))):
+            continue
+        again = fit_from(eye, around.voxels, stack, around.config)
+        if again is not None and not _fault(again, around):
+            fits[k] = again
+    z = around.ground.height_m(float(eye[0]), float(eye[1])) + _EYE_HEIGHT_M
+    return replace(around, eye_m=np.array([eye[0], eye[1], z]))
+
+
+def _origin_inside(frame: Upright) -> bool:
+    origin = frame.from_input(np.zeros(3))[:2]
+    return bool(((origin > frame.low[:2]) & (origin < frame.high[:2])).all())
+
+
+def _fault(cylinder: Cylinder, around: Surroundings) -> str:
+    base = base_point(cylinder, around.ground)
+    low, high = cylinder.z_low_m - base[2], cylinder.z_high_m - base[2]
+    return shape_fault(cylinder, low, high, around.span_m, around.config)
 
 
 def _examine(
@@ -110,7 +164,8 @@ def _post_fault(cylinder: Cylinder, top_m: float, z_top: float, around: Surround
     if top_m >= around.config.post_top_m:
         return ""
     free = axis_at(cylinder, z_top + 0.35)
-    if not space_above_was_seen(free, around.views, around.frame, around.above_m, z_top):
+    seen = space_above_was_seen(free, around.views, around.frame, around.above_m, z_top)
+    if not seen and (around.eye_m is None or not seen_from_eye(free, around.eye_m, around.voxels, around.above_m)):
         return ""
     return f"ends {top_m:.1f} m above ground with free space seen above it: a post"
 

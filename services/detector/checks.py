@@ -9,6 +9,7 @@ from services.detector.config import DetectorConfig
 from services.detector.cylinders import Cylinder
 from services.detector.model import Floats, Ground, Ints, Views
 from services.detector.upright import Floats32, Upright
+from services.detector.voxels import Voxels
 
 _BAND_M = 0.15
 _MAX_FILL = 0.4
@@ -134,3 +135,14 @@ def space_above_was_seen(p_m: Floats, views: Views | None, frame: Upright, above
     if views is not None or len(above_m) == 0:
         return False
     return int(_places_above(above_m, float(p_m[0]), float(p_m[1]), z_top_m + 0.4, z_top_m + 1.5)) >= 20
+
+
+def seen_from_eye(p_m: Floats, eye_m: Floats, voxels: Voxels, above_m: Floats32) -> bool:
+    """Tell whether an eye that sees as steeply everywhere as it does somewhere had a point (3,) in view, upright frame."""
+    points = np.concatenate(
+        [voxels.xyz_m[:: max(1, len(voxels.xyz_m) // 5000)], above_m[:: max(1, len(above_m) // 5000)]]
+    )
+    d = points - eye_m
+    steep = d[:, 2] / np.maximum(np.hypot(d[:, 0], d[:, 1]), 0.5)
+    to = p_m - eye_m
+    return bool(to[2] / max(float(np.hypot(to[0], to[1])), 0.5) < 0.9 * float(np.percentile(steep, 99.0)))

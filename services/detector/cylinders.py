@@ -7,12 +7,13 @@ the ray as in ``arcs``; robust Gauss-Newton (Tukey); the covariance is the inver
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from services.detector.config import DetectorConfig
 from services.detector.cylinder_kernels import assess, fit_axis
+from services.detector.facing import facing
 from services.detector.model import Floats
 from services.detector.stacks import Stack
 from services.detector.voxels import Voxels
@@ -56,6 +57,22 @@ class Cylinder:
     """Mean distance it was seen from, 0 where views are unknown."""
     covariance: Floats
     """(6, 6) of x, y (at ``at_m``), the two slopes, radius, taper."""
+    told_ray: Floats | None = None
+    """(2,) in the plan, from the eye: where views are unknown and one side of the trunk tells."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """What ``fit_axis`` gives: the last turn's points, rays and ranges in the axis frame, and the answer."""
+
+    P: Floats
+    U: Floats
+    G: Floats
+    x: Floats
+    scale: float
+    at: Floats
+    slope: Floats
+    normal: Floats
 
 
 def _priors(radius: float) -> Floats:
@@ -79,33 +96,79 @@ def _margin_m(stack: Stack, config: DetectorConfig) -> float:
 
 def fit_cylinder(voxels: Voxels, stack: Stack, config: DetectorConfig) -> Cylinder | None:
     """Return the joint fit of a candidate, or None when too few points remain or it leaves its slices."""
+    if voxels.seen_from:
+        found = _fitted(voxels, voxels.ray_m, stack, config, 1.0, _priors(stack.radius_m))
+        return None if found is None else _measured(found, config)
+    # without views the noise is not known beforehand
+    found = _fitted(voxels, voxels.ray_m, stack, config, 3.0, _priors(stack.radius_m))
+    if found is None:
+        return None
+    faced = _as_faced(voxels, stack, found, config)
+    return faced if faced is not None else _measured(found, config)
+
+
+def _fitted(
+    voxels: Voxels, ray: Floats, stack: Stack, config: DetectorConfig, start: float, prior: Floats
+) -> _Fit | None:  # fmt: skip
     at, slope = stack.at_m.copy(), stack.slope.copy()
     normal, x = np.zeros((6, 6)), np.zeros(6)
-    start = 1.0 if voxels.seen_from else 3.0  # without views the noise is not known beforehand
     scale, P, U, G = fit_axis(
-        voxels.xyz_m, voxels.ray_m, at, slope, stack.radius_m, _margin_m(stack, config), stack.z_low_m - 0.15,
-        stack.z_high_m + 0.15, start, _CORRELATED, config.range_noise_per_m, config.surface_noise_m, _priors(stack.radius_m),
-        normal, x,
+        voxels.xyz_m, ray, at, slope, stack.radius_m, _margin_m(stack, config), stack.z_low_m - 0.15,
+        stack.z_high_m + 0.15, start, _CORRELATED, config.range_noise_per_m, config.surface_noise_m, prior, normal, x,
     )  # fmt: skip
-    return None if scale < 0.0 else _measured(P, U, G, x, float(scale), at, slope, normal, config)
+    return None if scale < 0.0 else _Fit(P, U, G, x, float(scale), at, slope, normal)
 
 
-def _measured(
-    P: Floats, U: Floats, G: Floats, x: Floats, scale: float, at: Floats, slope: Floats, normal: Floats,
-    config: DetectorConfig,
-) -> Cylinder | None:  # fmt: skip
+def _as_faced(voxels: Voxels, stack: Stack, found: _Fit, config: DetectorConfig) -> Cylinder | None:
+    """Return the fit along the ray that a one-sided trunk tells itself, twice: the first circle is too thin to tell it well."""
+    radial_m = float(found.x[4])
+    for _ in range(2):
+        seen = facing(found.P, found.x)
+        if seen is None:
+            return None
+        range_m = seen.range_m(config.range_noise_per_m, config.surface_noise_m)
+        ray = np.tile(np.array([*(range_m * seen.ray), 0.0]), (len(voxels.xyz_m), 1))
+        inferred = replace(stack, range_m=range_m, radius_m=max(float(found.x[4]), stack.radius_m))
+        prior = _priors(inferred.radius_m)
+        prior[4, 1] = 1.0 / (0.3 * inferred.radius_m + 0.01) ** 2  # the slices' radius is biased
+        faced = _fitted(voxels, ray, inferred, config, 1.0, prior)
+        if faced is None:
+            return None
+        found = faced
+    seen = facing(found.P, found.x)
+    if seen is None or not seen.plausible(float(found.x[4]), radial_m):
+        return None
+    measured = _measured(found, config)
+    return None if measured is None else replace(measured, told_ray=seen.ray)
+
+
+def fit_from(eye_m: Floats, voxels: Voxels, stack: Stack, config: DetectorConfig) -> Cylinder | None:
+    """Return the joint fit of a candidate as seen from a place in the plan (2,), upright frame."""
+    to = stack.at_m[:2] - eye_m
+    range_m = float(np.hypot(to[0], to[1]))
+    if range_m < 0.4:
+        return None
+    ray = np.column_stack([voxels.xyz_m[:, :2] - eye_m, np.zeros(len(voxels.xyz_m))])
+    prior = _priors(stack.radius_m)
+    prior[4, 1] = 1.0 / (0.3 * stack.radius_m + 0.01) ** 2  # the slices' radius is biased
+    found = _fitted(voxels, ray, replace(stack, range_m=range_m), config, 1.0, prior)
+    return None if found is None else _measured(found, config)
+
+
+def _measured(fit: _Fit, config: DetectorConfig) -> Cylinder | None:
+    P, U, G, x, at, slope = fit.P, fit.U, fit.G, fit.x, fit.at, fit.slope
     on, counts = np.zeros(len(P), dtype=np.int64), np.zeros(8)
     z_low = float(P[:, 2].min())
     bands = np.zeros(int((P[:, 2].max() - z_low) / 0.1) + 1, dtype=np.int64)
-    assess(P, U, G, x, scale, config.range_noise_per_m, config.surface_noise_m, on, counts, bands, z_low)
+    assess(P, U, G, x, fit.scale, config.range_noise_per_m, config.surface_noise_m, on, counts, bands, z_low)
     held = np.flatnonzero(bands >= 3)
     if len(held) == 0:
         return None
     axis = np.array([slope[0], slope[1], 1.0]) / np.sqrt(1.0 + float(slope @ slope))
     low, high = z_low + 0.1 * held[0], min(z_low + 0.1 * (held[-1] + 1), float(P[:, 2].max()))
-    covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    covariance = np.asarray(np.linalg.inv(fit.normal), dtype=np.float64)
     return Cylinder(
-        at_m=at, axis=axis, radius_m=float(x[4]), taper=float(x[5]), noise_m=float(counts[4]), scale=scale,
+        at_m=at, axis=axis, radius_m=float(x[4]), taper=float(x[5]), noise_m=float(counts[4]), scale=fit.scale,
         points=int(counts[0]), inside=int(counts[1]), around=int(counts[2]),
         fill=float(counts[6] / 0.36 / max(counts[7] / 0.8, 1.0)), arc_rad=min(float(counts[3]), 2.0 * np.pi),
         z_low_m=float(at[2] + low * axis[2]), z_high_m=float(at[2] + high * axis[2]),

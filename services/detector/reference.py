@@ -167,11 +167,11 @@ def circle_lm(points_m: Floats) -> tuple[float, float, float, float]:
     return float(x[0]), float(x[1]), float(x[2]), float(np.sqrt(np.mean(e**2)))
 
 
-def slice_circles(points_m: Floats, z_m: float, thickness_m: float) -> list[HullCircle]:
+def slice_circles(points_m: Floats, z_m: float, thickness_m: float, cluster_m: float = CLUSTER_M) -> list[HullCircle]:
     """Return the circles of one slice plane."""
     flat = project_pairs(points_m, z_m, thickness_m)
     circles = []
-    for members in euclidean_clusters(flat, CLUSTER_M):
+    for members in euclidean_clusters(flat, cluster_m):
         if not CLUSTER_SIZE[0] <= len(members) <= CLUSTER_SIZE[1]:
             continue
         hull = graham_hull(flat[members])
@@ -205,9 +205,11 @@ def _follows(below: HullCircle, above: HullCircle) -> bool:
     return bool(place < SAME_PLACE_M and abs(above.radius_m - below.radius_m) < SAME_RADIUS_M)
 
 
-def detect_reference(points_m: NDArray[np.floating], up: tuple[float, float, float]) -> DetectionResult:
+def detect_reference(
+    points_m: NDArray[np.floating], up: tuple[float, float, float], leaf_m: float = LEAF_M, cluster_m: float = CLUSTER_M
+) -> DetectionResult:
     """Return the trunks that the reference's slicing finds in a cloud (N, 3) of finite points."""
-    cloud = voxel_centroids(np.asarray(points_m, dtype=np.float64), LEAF_M)
+    cloud = voxel_centroids(np.asarray(points_m, dtype=np.float64), leaf_m)
     normal, offset = ground_plane(cloud, np.asarray(up) / np.linalg.norm(up))
     R = rotation_aligning(normal, (0.0, 0.0, 1.0))
     upright = cloud @ R.T - np.array([0.0, 0.0, offset])
@@ -216,7 +218,7 @@ def detect_reference(points_m: NDArray[np.floating], up: tuple[float, float, flo
         return result_of([], R, offset, up, len(points_m))
     thickness = 4.0 * density_m(objects)
     levels = np.arange(0.3, LIMIT_M - 0.05, SPACING_M)
-    stacks = stack([slice_circles(objects, float(z), thickness) for z in levels])
+    stacks = stack([slice_circles(objects, float(z), thickness, cluster_m) for z in levels])
     return result_of([_trunk(s) for s in stacks], R, offset, up, len(points_m))
 
 

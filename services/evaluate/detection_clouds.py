@@ -133,20 +133,19 @@ def fuse(depth: NDArray[np.uint16], poses: Floats) -> _Parts:
     return points, views.index, views.origins_m, rotations, views.tan_half or (0.0, 0.0)
 
 
-def raw_points(name: str, cache: Path, every: int = 1) -> tuple[NDArray[np.float32], Views]:
-    """Return all points of all keyframes of a scene without any filter but the range, each with its view."""
-    from services.mapper.cloud import pixel_rays
+def keyframe_points(name: str, cache: Path) -> tuple[NDArray[np.float32], Views]:
+    """Return the filtered points of all keyframes of a scene, not thinned against each other, each with its view."""
+    from services.mapper.cloud import keyframe_cloud, pixel_rays
+    from services.mapper.config import MapperConfig
     from services.simulator.render import DEFAULT_INTRINSICS
 
     shots = _cached_shots(name, cache)
-    rays = pixel_rays(DEFAULT_INTRINSICS)
+    config, rays = MapperConfig(), pixel_rays(DEFAULT_INTRINSICS)
     points, index = [], []
     for k, (image, T) in enumerate(zip(shots.depth, shots.poses, strict=True)):
-        z = image.astype(np.float32).ravel() * np.float32(0.001)
-        good = np.flatnonzero((z > 0.5) & (z <= 6.0))[k % every :: every]
-        local = np.column_stack([rays.reshape(-1, 2)[good] * z[good, None], z[good]])
+        local = keyframe_cloud(image.astype(np.float32) * np.float32(0.001), None, rays, config).points_m
         points.append((local @ T[:3, :3].T + T[:3, 3]).astype(np.float32))
-        index.append(np.full(len(good), k, dtype=np.int32))
+        index.append(np.full(len(local), k, dtype=np.int32))
     views = Views(np.concatenate(index), shots.poses[:, :3, 3].copy(), shots.poses[:, :3, :3].copy(), (0.64, 0.48))
     return np.concatenate(points), views
 
