@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from schemas.topics import VEHICLE_STATE
 from schemas.vehicle import VehicleState
 from services.camera.sources import Source, open_recording
-from services.evaluate import exports
+from services.evaluate import exports, gis_exports
 from services.evaluate.atomic import prepare, write_files
 from services.evaluate.metrics import metrics, metrics_bytes
 from services.evaluate.offline import Counts, OfflineResult, run_offline
@@ -64,7 +64,8 @@ def _vehicle_states(sequence: Path) -> Iterator[VehicleState]:
 
 
 def result_files(title: str, result: OfflineResult, values: dict[str, Any]) -> dict[str, bytes]:
-    """Return the contract's files by name."""
+    """Return the contract's files by name, and those for a GIS and for point-cloud programs."""
+    stamp_ns = result.online[-1][0] if result.online else 0
     return {
         "trajectory.txt": exports.trajectory_bytes(result.trajectory),
         "trajectory_online.txt": exports.trajectory_bytes(result.online),
@@ -72,6 +73,8 @@ def result_files(title: str, result: OfflineResult, values: dict[str, Any]) -> d
         "trees.json": exports.trees_json(result.trees, "map"),
         "trees.csv": exports.trees_csv(result.trees),
         "trees.geojson": exports.trees_geojson(result.trees, "map"),
+        "trees.gpkg": gis_exports.trees_gpkg(result.trees, stamp_ns),
+        "cloud.laz": gis_exports.cloud_laz(result.points_m, result.rgb, stamp_ns),
         "targets.jsonl": exports.targets_jsonl(result.targets),
         "metrics.json": metrics_bytes(values),
         "report.html": report_bytes(

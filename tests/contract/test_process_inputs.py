@@ -141,8 +141,8 @@ def test_all_results_are_written_and_no_trees_is_a_result(tmp_path: Path) -> Non
     folder, out = write_tum(tmp_path / "sequence", 4), tmp_path / "deep" / "out"
     assert invoke(["process", str(folder), "--out", str(out)]) == 0
     assert sorted(path.name for path in out.iterdir()) == [
-        "cloud.ply", "metrics.json", "report.html", "targets.jsonl", "trajectory.txt", "trajectory_online.txt",
-        "trees.csv", "trees.geojson", "trees.json",
+        "cloud.laz", "cloud.ply", "metrics.json", "report.html", "targets.jsonl", "trajectory.txt", "trajectory_online.txt",
+        "trees.csv", "trees.geojson", "trees.gpkg", "trees.json",
     ]  # fmt: skip
     assert json.loads((out / "trees.json").read_text()) == {"frame": "map", "trees": []}
     assert [path.name for path in out.parent.iterdir()] == ["out"]

@@ -18,6 +18,8 @@ RESULTS = (
     "trees.json",
     "trees.csv",
     "trees.geojson",
+    "trees.gpkg",
+    "cloud.laz",
     "trajectory.txt",
     "trajectory_online.txt",
     "cloud.ply",
