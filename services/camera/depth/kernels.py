@@ -34,11 +34,18 @@ def to_depth(inverse: Image, out: Image) -> None:
 
 
 @njit(cache=True, nogil=True)
-def drop_mixed(inverse: Image, step: float, reach: int, out: Image) -> None:
+def drop_mixed(
+    inverse: Image, row_max: Image, row_min: Image, column_max: Image, column_min: Image, noise: float, gap_m: float,
+    reach: int, out: Image,
+) -> None:  # fmt: skip
     """Copy, leaving out pixels that hang between two surfaces.
 
-    A pixel is mixed when, along the row or the column, one side within ``reach`` is nearer by more than ``step`` and
-    the other side is farther by more than ``step`` (or has no data): a surface seen at a slant changes by less.
+    A pixel is mixed when, along the row or the column, one side within ``reach`` is nearer and the other side farther,
+    each by more than noise explains (``noise``, 1/m) and by more than ``gap_m``: a round trunk or the ground at a slant
+    changes by less. Beside an object the sensor is often blind: a side without any data within ``reach`` agrees with
+    whatever the other side says.
+
+    ``row_max`` ...: the largest and smallest value within ``reach`` along row and column; few pixels need more than them.
     """
     height, width = inverse.shape
     for v in range(height):
@@ -47,14 +54,44 @@ def drop_mixed(inverse: Image, step: float, reach: int, out: Image) -> None:
             out[v, u] = w
             if w == 0.0:
                 continue
-            left = inverse[v, u - reach] if u >= reach else w
-            right = inverse[v, u + reach] if u + reach < width else w
-            up = inverse[v - reach, u] if v >= reach else w
-            down = inverse[v + reach, u] if v + reach < height else w
-            across = (left - w > step and w - right > step) or (right - w > step and w - left > step)
-            along = (up - w > step and w - down > step) or (down - w > step and w - up > step)
-            if across or along:
+            step = max(noise, gap_m * w * w)
+            across = row_max[v, u] - w > step and w - row_min[v, u] > step
+            along = column_max[v, u] - w > step and w - column_min[v, u] > step
+            if (across and _hangs(inverse, v, u, 0, 1, step, reach)) or (
+                along and _hangs(inverse, v, u, 1, 0, step, reach)
+            ):
                 out[v, u] = 0.0
+
+
+@njit(cache=True, nogil=True)
+def _hangs(inverse: Image, v: int, u: int, dv: int, du: int, step: float, reach: int) -> bool:
+    """Return whether the pixel lies between its two sides along (dv, du)."""
+    near_before, far_before, data_before, blind_before = _side(inverse, v, u, -dv, -du, step, reach)
+    near_behind, far_behind, data_behind, blind_behind = _side(inverse, v, u, dv, du, step, reach)
+    between = (near_before and far_behind) or (near_behind and far_before)
+    beside_blind = (near_before and blind_behind and not data_behind) or (
+        near_behind and blind_before and not data_before
+    )
+    return between or beside_blind
+
+
+@njit(cache=True, nogil=True)
+def _side(inverse: Image, v: int, u: int, dv: int, du: int, step: float, reach: int) -> tuple[bool, bool, bool, bool]:
+    """Return whether a side has data nearer by ``step``, farther by ``step``, any data, any pixel without."""
+    near, far, data, blind = False, False, False, False
+    w = inverse[v, u]
+    for k in range(1, reach + 1):
+        y, x = v + k * dv, u + k * du
+        if y < 0 or x < 0 or y >= inverse.shape[0] or x >= inverse.shape[1]:
+            break
+        other = inverse[y, x]
+        if other > 0.0:
+            data = True
+            near = near or other - w > step
+            far = far or w - other > step
+        else:
+            blind = True
+    return near, far, data, blind
 
 
 @njit(cache=True, nogil=True)

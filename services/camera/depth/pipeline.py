@@ -12,8 +12,10 @@ from services.camera.depth import kernels
 from services.camera.depth.config import DepthConfig
 from services.camera.depth.kernels import Grey, Image
 
-_MIXED_SIGMAS = 12.0
-_MIXED_REACH_PX = 3
+_MIXED_SIGMAS = 8.0
+_MIXED_GAP_M = 0.05
+"""Mixed pixels matter where they hang further than this from either surface."""
+_MIXED_REACH_PX = 4
 _SAME_SURFACE_SIGMAS = 8.0
 _TEMPORAL_SIGMAS = 3.0
 
@@ -37,6 +39,7 @@ class DepthPipeline:
         self._shape = shape
         self._a, self._b = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         self._past = np.zeros(shape, np.float32)
+        self._extremes = [np.zeros(shape, np.float32) for _ in range(4)]
         self._no_grey: Grey = np.zeros((1, 1), np.uint8)
 
     def process(self, depth_m: Image, grey: Grey | None = None) -> Processed:
@@ -78,7 +81,19 @@ class DepthPipeline:
         return stages
 
     def _drop_mixed(self, image: Image, out: Image) -> None:
-        kernels.drop_mixed(image, _MIXED_SIGMAS * self._config.sigma_inverse, _MIXED_REACH_PX, out)
+        """Compare with the extremes along row and column first: nine pixels of ten need no closer look."""
+        import cv2
+
+        side = 2 * _MIXED_REACH_PX + 1
+        extremes = self._extremes
+        for k, shape in enumerate(((1, side), (side, 1))):
+            window = np.ones(shape, np.uint8)
+            cv2.dilate(image, window, dst=extremes[2 * k])
+            cv2.erode(image, window, dst=extremes[2 * k + 1])
+        noise = _MIXED_SIGMAS * self._config.sigma_inverse
+        kernels.drop_mixed(
+            image, extremes[0], extremes[1], extremes[2], extremes[3], noise, _MIXED_GAP_M, _MIXED_REACH_PX, out
+        )
 
     def _bilateral(self, image: Image, out: Image) -> None:
         """Bilateral filter (Tomasi and Manduchi 1998). A hole is so far from any data that neither sees the other."""
