@@ -16,14 +16,15 @@ from numpy.typing import NDArray
 from services.inventory.config import InventoryConfig
 from services.inventory.merge import Array, Spots, assign
 
-_MOST_TREES = 60
+_MOST_TREES = 40
 _MIN_PAIR_M = 1.0
 _MAX_PAIR_M = 25.0
 _CLEAR_SHARE = 0.75
 """Another placement that explains this share of the best one's trees makes it ambiguous."""
 _SAME_TURN_RAD = math.radians(2.0)
-_HYPOTHESES = 4_000
+_HYPOTHESES = 3_000
 _SEPARATE_M = 0.6
+_CELL_M = 0.1
 _LEAST_SHARE = 0.4
 """Of the flight's trees that lie within the inventory's reach, at least so many must agree."""
 
@@ -58,7 +59,7 @@ def align(flight: Spots, known: Spots, config: InventoryConfig, prior: Prior | N
     turns, shifts = _hypotheses(flight, known, config, prior)
     if not len(turns):
         return None
-    votes = np.array([_votes(flight, known, config, t, s) for t, s in zip(turns, shifts, strict=True)])
+    votes = _votes(flight, known, config, turns, shifts)
     best = int(np.argmax(votes))
     if votes[best] < least or _rival(flight, turns, shifts, votes, best) >= _CLEAR_SHARE * votes[best]:
         return None
@@ -147,12 +148,27 @@ def _moved(flight: Spots, turn: float, shift: Array) -> Spots:
     return Spots(xy, flight.radius_m, flight.sigma_xy_m, flight.sigma_radius_m)
 
 
-def _votes(flight: Spots, known: Spots, config: InventoryConfig, turn: float, shift: Array) -> int:
-    """Return how many of the flight's trees stand on a known one of like radius."""
-    xy = _turned(flight.xy_m, np.full(len(flight), turn)) + shift
-    d2 = (xy[:, None, 0] - known.xy_m[None, :, 0]) ** 2 + (xy[:, None, 1] - known.xy_m[None, :, 1]) ** 2
-    d2[np.abs(flight.radius_m[:, None] - known.radius_m[None, :]) > config.merge_radius_m] = np.inf
-    return int((d2.min(axis=1) <= config.merge_m**2).sum())
+def _votes(flight: Spots, known: Spots, config: InventoryConfig, turns: Array, shifts: Array) -> NDArray[np.int64]:
+    """Return for each placement how many of the flight's trees stand on a known one of like radius.
+
+    The known trees are painted as discs into a grid that holds their radii, so that a vote is one look-up.
+    """
+    low = known.xy_m.min(axis=0) - config.merge_m
+    size = np.ceil((known.xy_m.max(axis=0) + config.merge_m - low) / _CELL_M).astype(np.int64) + 1
+    grid = np.full((int(size[0]) + 2, int(size[1]) + 2), np.nan)  # its border stands for everything outside
+    reach = int(config.merge_m / _CELL_M)
+    steps = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2), axis=-1).reshape(-1, 2)
+    steps = steps[np.hypot(*steps.T) * _CELL_M <= config.merge_m]
+    centre = ((known.xy_m - low) / _CELL_M).astype(np.int64) + 1
+    for step in steps[np.argsort(-np.hypot(*steps.T), kind="stable")]:  # the nearer disc is painted over the farther
+        cell = np.clip(centre + step, 1, size)
+        grid[cell[:, 0], cell[:, 1]] = known.radius_m
+    c, s = np.cos(turns)[:, None], np.sin(turns)[:, None]
+    x, y = flight.xy_m[:, 0][None], flight.xy_m[:, 1][None]
+    u = ((c * x - s * y + shifts[:, :1] - low[0]) / _CELL_M).astype(np.int64) + 1
+    v = ((s * x + c * y + shifts[:, 1:] - low[1]) / _CELL_M).astype(np.int64) + 1
+    there = grid[np.clip(u, 0, size[0] + 1), np.clip(v, 0, size[1] + 1)]
+    return np.asarray((np.abs(there - flight.radius_m[None]) <= config.merge_radius_m).sum(axis=1), dtype=np.int64)
 
 
 def _rival(flight: Spots, turns: Array, shifts: Array, votes: NDArray[np.int64], best: int) -> int:

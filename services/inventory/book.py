@@ -29,9 +29,13 @@ from services.inventory.values import (
 
 _RAN_BACK_NS = 5_000_000_000
 _PRIOR_SIGMAS = 3.0
+_NEWS_SHARE = 1.05
+"""A flight is laid on a site again when both have grown by so much since it was tried last."""
 _WRITE_MOVE_M = 0.002
 _WRITE_RADIUS_M = 0.0005
-_WRITE_EVERY_NS = 10_000_000_000
+_WRITE_SIGMAS = 0.5
+_FINE_EVERY_NS = 10_000_000_000
+"""A tree that moved by less than half its doubt is no news, and is written this often only."""
 
 
 class Inventory:
@@ -51,7 +55,8 @@ class Inventory:
             self._of_tree.setdefault(sighting.tree, {})[sighting.fid] = sighting
         self._next_tree = max(self.trees, default=0) + 1
         self._next_sighting = max(self.sightings, default=0) + 1
-        self._tried: dict[tuple[int, int], tuple[int, int]] = {}
+        self._fine_ns: dict[int, int] = {}
+        self._tried: dict[tuple[int, int], int] = {}
         self.changes = Changes()
 
     def written(self) -> Changes:
@@ -80,8 +85,6 @@ class Inventory:
                 touched.add(tree.fid)
         for fid in sorted(touched):
             self._refresh(fid, now_ns)
-        if not flight.aligned:
-            self._try_align(flight, now_ns)
         return flight
 
     def _flight(self, uav: str, trees: TreeList, now_ns: int) -> Flight:
@@ -173,26 +176,43 @@ class Inventory:
         """Take the new beliefs and keep those worth keeping in the history; return the trees they touch."""
         touched: set[int] = set()
         seen = self._of_flight[flight.fid]
+        fine = now_ns - self._fine_ns.get(flight.fid, 0) >= _FINE_EVERY_NS
+        if fine:
+            self._fine_ns[flight.fid] = now_ns
+        sigmas = 0.0 if fine else _WRITE_SIGMAS
         for tree in trees.trees:
             sighting = seen[tree.id]
-            before, now = sighting.belief, belief_of(tree)
-            fresh = sighting.kept is None
-            if now == before and sighting.present and not fresh:
+            if self._no_news(sighting, tree, now_ns, sigmas):
                 continue
-            if self._worth_keeping(sighting, now, now_ns):
-                self._keep(flight, sighting, now, now_ns, trees.stamp_ns)
-            elif sighting.present and not _moved(before, now, _WRITE_MOVE_M, _WRITE_RADIUS_M):
-                continue  # written with the next that matters: the belief is the same for every use
-            sighting.belief, sighting.present = now, True
+            belief = belief_of(tree)
+            if self._worth_keeping(sighting, belief, now_ns):
+                self._keep(flight, sighting, belief, now_ns, trees.stamp_ns)
+            sighting.belief, sighting.present = belief, True
             self.changes.sightings[sighting.fid] = sighting
             touched.add(sighting.tree)
         return touched
+
+    def _no_news(self, sighting: Sighting, t: Tree, now_ns: int, sigmas: float) -> bool:
+        """Whether a tree stands where it stood, within a part of its doubt: this runs for every tree of every list."""
+        b = sighting.belief
+        step_m = max(_WRITE_MOVE_M, sigmas * b.sigma_xy_m)
+        return (
+            sighting.present
+            and sighting.kept is not None
+            and abs(t.x_m - b.x_m) < step_m
+            and abs(t.y_m - b.y_m) < step_m
+            and abs(t.radius_m - b.radius_m) < max(_WRITE_RADIUS_M, sigmas * b.sigma_radius_m)
+            and t.sigma_xy_m > 0.8 * b.sigma_xy_m
+            and t.suitable == b.suitable
+            and (t.observations <= b.observations or now_ns - sighting.kept_ns < self._config.history_every_s * 1e9)
+        )
 
     def _worth_keeping(self, sighting: Sighting, now: Belief, now_ns: int) -> bool:
         kept, c = sighting.kept, self._config
         if kept is None or kept.suitable != now.suitable:
             return True
-        if _moved(kept, now, c.history_move_m, c.history_radius_m):
+        step_m = max(c.history_move_m, _WRITE_SIGMAS * now.sigma_xy_m)
+        if _moved(kept, now, step_m, max(c.history_radius_m, _WRITE_SIGMAS * now.sigma_radius_m)):
             return now_ns - sighting.kept_ns >= 1_000_000_000
         return now.observations > kept.observations and now_ns - sighting.kept_ns >= c.history_every_s * 1e9
 
@@ -232,34 +252,47 @@ class Inventory:
 
     # -- joining flights
 
-    def _try_align(self, flight: Flight, now_ns: int) -> None:
-        """Lay the flight on the others of its site (a flight without a start point: on any other local site)."""
-        sightings = [s for s in self._of_flight[flight.fid].values() if s.present]
-        if len(sightings) < self._config.align_min_trees:
-            return
-        spots = self._placed(flight, [s.belief for s in sightings])
-        for site in self._sites_to_try(flight):
-            known = [t for t in self.trees.values() if t.site == site and t.status == "present"]
-            if site == flight.site:
-                own = {s.tree for s in sightings}
-                known = [t for t in known if t.fid not in own]
-            if self._tried.get((flight.fid, site)) == (len(sightings), len(known)):
+    def join_next(self, now_ns: int) -> bool:
+        """Try to lay one flight on one site (its own; without a start point any other local one); 10 to 20 ms.
+
+        Returns:
+            Whether there was anything to try: call again until there is not, but not all at once.
+        """
+        trees: dict[int, list[InventoryTree]] = {}
+        for tree in self.trees.values():
+            if tree.status == "present":
+                trees.setdefault(tree.site, []).append(tree)
+        for flight in self.flights.values():
+            if flight.aligned:
                 continue
-            self._tried[flight.fid, site] = (len(sightings), len(known))
-            prior = None
-            if flight.frame == "global":
-                prior = Prior(_PRIOR_SIGMAS * max(flight.sigma_heading_rad, 0.01) * math.sqrt(2.0),
-                              _PRIOR_SIGMAS * max(flight.sigma_m, 0.1) * math.sqrt(2.0))  # fmt: skip
-            found = align(spots, self._known(known), self._config, prior)
-            if found is not None:
-                self._join(flight, site, found, now_ns)
-                return
+            sightings = [s for s in self._of_flight[flight.fid].values() if s.present]
+            for site in self._sites_to_try(flight):
+                own = {s.tree for s in sightings} if site == flight.site else set()
+                known = [t for t in trees.get(site, ()) if t.fid not in own]
+                least, size = self._config.align_min_trees, len(sightings) + len(known)
+                enough = len(sightings) >= least and len(known) >= least
+                if enough and size > _NEWS_SHARE * self._tried.get((flight.fid, site), 0):
+                    self._tried[flight.fid, site] = size
+                    self._try(flight, sightings, site, known, now_ns)
+                    return True
+        return False
+
+    def _try(
+        self, flight: Flight, sightings: list[Sighting], site: int, known: list[InventoryTree], now_ns: int
+    ) -> None:
+        prior = None
+        if flight.frame == "global":
+            turn_rad, shift_m = max(flight.sigma_heading_rad, 0.01), max(flight.sigma_m, 0.1)
+            prior = Prior(_PRIOR_SIGMAS * turn_rad * math.sqrt(2.0), _PRIOR_SIGMAS * shift_m * math.sqrt(2.0))
+        found = align(self._placed(flight, [s.belief for s in sightings]), self._known(known), self._config, prior)
+        if found is not None:
+            self._join(flight, site, found, now_ns)
 
     def _sites_to_try(self, flight: Flight) -> list[int]:
         if flight.frame == "global":
             return [flight.site]
         occupied = {f.site for f in self.flights.values() if f.frame == "local" and f.fid != flight.fid}
-        return sorted(occupied - {flight.site})
+        return sorted(site for site in occupied if site < flight.site)  # the older one stays where it is
 
     def _join(self, flight: Flight, site: int, found: Alignment, now_ns: int) -> None:
         """Move the flight into the site by what was found, and its trees onto the trees there."""
@@ -268,7 +301,8 @@ class Inventory:
         flight.place = replace(place, theta_rad=place.theta_rad + found.theta_rad, x_m=x, y_m=y)
         flight.site, flight.aligned = site, True
         flight.sigma_m, flight.sigma_heading_rad = max(found.rms_m, 0.02), 0.01
-        flight.note = f"laid on the inventory by {found.agreeing} trees, {found.rms_m:.2f} m"
+        where = "" if flight.frame == "global" else "; local coordinates"
+        flight.note = f"laid on the inventory by {found.agreeing} trees, {found.rms_m:.2f} m{where}"
         self.changes.flights[flight.fid] = flight
         sightings = list(self._of_flight[flight.fid].values())
         alone = [s for s in sightings if len(self._of_tree[s.tree]) == 1]

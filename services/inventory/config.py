@@ -39,7 +39,7 @@ class InventoryConfig(BaseModel):
     align_min_trees: int = Field(default=4, ge=3)
     """A flight is laid on the inventory by the pattern of its trees when at least so many agree."""
     history_move_m: float = Field(default=0.01, ge=0.0)
-    """A measurement enters the history when the tree moved by this since the last one kept..."""
+    """A measurement enters the history when the tree moved by this (and half its doubt) since the last one kept..."""
     history_radius_m: float = Field(default=0.003, ge=0.0)
     """... or its radius changed by this ..."""
     history_every_s: float = Field(default=10.0, gt=0.0)

@@ -103,6 +103,7 @@ class Keeper:
         self._bound()
         if self._waiting:
             self._commit()
+        self.inventory.join_next(now_ns)  # after the commit, and one at a time: no list waits for it
 
     def _commit(self) -> None:
         begin_s = time.monotonic()

@@ -54,6 +54,13 @@ def seen_from(
     return moved
 
 
+def take(book: Inventory, uav: str, trees: TreeList, now_ns: int) -> None:
+    """Take a list and join what can be joined."""
+    book.take(uav, trees, now_ns)
+    while book.join_next(now_ns):
+        pass
+
+
 def present(book: Inventory) -> list[int]:
     return sorted(t.fid for t in book.trees.values() if t.status == "present")
 
@@ -161,9 +168,9 @@ def test_a_station_that_was_restarted_doubles_nothing() -> None:
 def test_two_flights_join_by_the_pattern_of_their_trees_whatever_compass_and_gps_say() -> None:
     book = Inventory(InventoryConfig(start_points=(START,)))
     world = forest(5)
-    book.take("uav1", listed(seen_from(world, 0.0, 0.0, 0.0, 1)), S)
+    take(book, "uav1", listed(seen_from(world, 0.0, 0.0, 0.0, 1)), S)
     # begun 2 m off and 6 degrees askew of what the start point says
-    book.take("uav2", listed(seen_from(world, math.radians(6.0), 1.6, -1.2, 2), map_id="m2"), 2 * S)
+    take(book, "uav2", listed(seen_from(world, math.radians(6.0), 1.6, -1.2, 2), map_id="m2"), 2 * S)
     assert len(present(book)) == len(world)
     assert all(book.trees[k].flights == 2 for k in present(book))
     flight = book.flights[2]
@@ -176,17 +183,17 @@ def test_two_flights_join_by_the_pattern_of_their_trees_whatever_compass_and_gps
 def test_trees_that_come_later_join_as_they_come() -> None:
     book = Inventory(InventoryConfig(start_points=(START,)))
     world = forest(6)
-    book.take("uav1", listed(seen_from(world, 0.0, 0.0, 0.0, 1)), S)
+    take(book, "uav1", listed(seen_from(world, 0.0, 0.0, 0.0, 1)), S)
     second = seen_from(world, 0.05, 0.5, 0.5, 2)
     for count in range(1, len(second) + 1):
-        book.take("uav2", listed(second[:count], count * S, map_id="m2"), count * S)
+        take(book, "uav2", listed(second[:count], count * S, map_id="m2"), count * S)
     assert len(present(book)) == len(world)
 
 
 def test_a_forest_elsewhere_is_not_joined() -> None:
     book = Inventory(InventoryConfig(start_points=(START,)))
-    book.take("uav1", listed(forest(7)), S)
-    book.take("uav2", listed(forest(8), map_id="m2"), S)
+    take(book, "uav1", listed(forest(7)), S)
+    take(book, "uav2", listed(forest(8), map_id="m2"), S)
     assert len(present(book)) == 28
 
 
@@ -194,8 +201,8 @@ def test_rows_of_a_plantation_are_too_alike_to_join() -> None:
     config = InventoryConfig(start_points=(START,))
     rows = [tree(5 * i + j + 1, 2.0 * i, 2.0 * j, 0.12) for i in range(5) for j in range(5)]
     book = Inventory(config)
-    book.take("uav1", listed(rows), S)
-    book.take("uav2", listed(seen_from(rows, 0.0, 1.0, 1.0, 2), map_id="m2"), S)
+    take(book, "uav1", listed(rows), S)
+    take(book, "uav2", listed(seen_from(rows, 0.0, 1.0, 1.0, 2), map_id="m2"), S)
     flight = book.flights[2]
     assert not flight.aligned or len(present(book)) == 25  # never wrongly joined: not at all, or rightly
 
@@ -203,19 +210,19 @@ def test_rows_of_a_plantation_are_too_alike_to_join() -> None:
 def test_local_flights_join_only_when_the_pattern_is_clear_and_say_that_they_are_local() -> None:
     book = Inventory(InventoryConfig())
     world = forest(9)
-    book.take("uav1", listed(world), S)
-    book.take("uav2", listed(seen_from(world, 2.0, 3.0, 1.0, 2), map_id="m2"), S)
+    take(book, "uav1", listed(world), S)
+    take(book, "uav2", listed(seen_from(world, 2.0, 3.0, 1.0, 2), map_id="m2"), S)
     assert len(present(book)) == len(world)
     assert {t.frame for t in book.trees.values()} == {"local"}
     assert "local" in book.flights[1].note
-    book.take("uav3", listed(seen_from(world, 1.0, 0.0, 0.0, 4)[:5], map_id="m3"), S)
+    take(book, "uav3", listed(seen_from(world, 1.0, 0.0, 0.0, 4)[:5], map_id="m3"), S)
     assert not book.flights[3].aligned  # five trees without any prior are no proof
 
 
 def test_a_docked_tree_stays_visited() -> None:
     book = Inventory(InventoryConfig())
     book.take("uav1", listed([tree(1, 4.0, 0.0)]), S, frozenset({1, 77}))
-    book.take("uav1", listed([tree(1, 4.0, 0.0)], 2 * S), 2 * S)
+    take(book, "uav1", listed([tree(1, 4.0, 0.0)], 2 * S), 2 * S)
     assert book.trees[1].visited
 
 

@@ -1,0 +1,348 @@
+"""The ground station under load: CPU, memory, messages lost, the page's frame rate; restarts; power cuts."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+from schemas.health import Health
+from schemas.topics import HEALTH
+from services.common.bus import Bus
+from services.common.context import HealthBook
+from services.common.errors import GoalNotReachedError
+from services.common.session import free_port, opened_client
+from services.evaluate.bench import BenchOptions, BenchReport
+from services.evaluate.station_load import Load
+
+_AIRCRAFT, _RATE_HZ, _TREES = 10, 5.0, 500
+_MEASURE_S, _QUICK_S = 30.0, 8.0
+_KILLS, _QUICK_KILLS = 100, 5
+_MOST_LOST_S = 1.0
+
+
+class Ground:
+    """Router and station as processes of their own, in a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.port, self.page_port = free_port(), free_port()
+        self.processes: dict[str, subprocess.Popen[bytes]] = {}
+
+    @property
+    def endpoint(self) -> str:
+        """The router's address."""
+        return f"tcp/127.0.0.1:{self.port}"
+
+    @property
+    def address(self) -> str:
+        """The page's address."""
+        return f"http://127.0.0.1:{self.page_port}/"
+
+    @property
+    def database(self) -> Path:
+        """The inventory's file."""
+        return self.folder / "inventory.gpkg"
+
+    def start(self, name: str) -> None:
+        """Start the router or the station."""
+        more = [] if name == "router" else ["--page-port", str(self.page_port), "--set",
+                                            f"station.inventory.database={self.database}"]  # fmt: skip
+        command = [sys.executable, "-m", "services.cli.app", name, "--port", str(self.port), *more]
+        with (self.folder / f"{name}.log").open("ab") as log:
+            self.processes[name] = subprocess.Popen(command, stdout=log, stderr=log)
+
+    def kill(self, name: str, number: int = signal.SIGKILL) -> None:
+        """End one of them."""
+        process = self.processes.pop(name)
+        process.send_signal(number)
+        process.wait(10.0)
+
+    def served(self) -> bool:
+        """Whether the page answers."""
+        with suppress(OSError), urllib.request.urlopen(self.address, timeout=0.5) as answer:
+            return bool(answer.status == 200)
+        return False
+
+    def close(self) -> None:
+        """End both."""
+        for name in list(self.processes):
+            self.kill(name)
+
+
+class Page:
+    """A page without a browser: its WebSocket, and what it was told."""
+
+    def __init__(self, ground: Ground) -> None:
+        from websockets.sync.client import connect
+        from websockets.typing import Origin
+
+        address, origin = ground.address.replace("http", "ws") + "ws", Origin(ground.address.rstrip("/"))
+        self._socket = connect(address, origin=origin, max_size=None, legacy=True)
+        self._socket.send(json.dumps({"t": "hello", "secret": "b" * 24, "name": "bench"}))
+        self.trees: dict[str, int] = {}
+        self.links: dict[str, str] = {}
+
+    def hear(self, timeout_s: float) -> None:
+        """Take one frame."""
+        frame = self._socket.recv(timeout=timeout_s)
+        body: dict[str, Any] = json.loads(frame) if isinstance(frame, str) else {"t": ""}
+        if body["t"] == "trees":
+            self.trees[body["uav"]] = len(body["rows"])
+        elif body["t"] == "state":
+            self.links = {view["uav"]: view["link"] for view in body["aircraft"]}
+
+    def right(self, aircraft: int, trees: int) -> bool:
+        """Whether it shows all aircraft with good links and all their trees."""
+        return (
+            len(self.links) == aircraft
+            and set(self.links.values()) == {"good"}
+            and list(self.trees.values()) == [trees] * aircraft
+        )
+
+    def close(self) -> None:
+        """Close it."""
+        self._socket.close()
+
+
+def run(options: BenchOptions) -> BenchReport:
+    """Measure load, restarts and power cuts."""
+    seed = options.seed or 0
+    seconds = _QUICK_S if options.quick else _MEASURE_S
+    kills = options.count or (_QUICK_KILLS if options.quick else _KILLS)
+    figures: dict[str, float] = {"aircraft": _AIRCRAFT}
+    with ExitStack() as stack:
+        ground = Ground(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="treedock-bench-"))))
+        stack.callback(ground.close)
+        ground.start("router")
+        ground.start("station")
+        load = stack.enter_context(Load(ground.endpoint, _AIRCRAFT, _RATE_HZ, _TREES, seed))
+        figures |= _load(ground, load, seconds, options.tell)
+        figures |= _restarts(ground, load, options.tell)
+        load.go(on=False)
+    with ExitStack() as stack:
+        ground = Ground(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="treedock-bench-"))))
+        stack.callback(ground.close)
+        ground.start("router")
+        load = stack.enter_context(Load(ground.endpoint, 1, _RATE_HZ, 50, seed + 1))
+        figures |= _power_cuts(ground, load, kills, np.random.default_rng(seed), options.tell)
+    conditions = {
+        "load": f"{_AIRCRAFT} aircraft, each {_RATE_HZ:g} Hz of pose, mission, vehicle, target and a list of {_TREES} trees, "
+        f"all of them moved by noise of 4 mm; {seconds:g} s; one page open",
+        "power cuts": f"{kills} times kill -9 of the station at a random moment, one aircraft with 50 trees",
+        "seed": str(seed),
+    }  # fmt: skip
+    return BenchReport(figures, conditions, _table(figures))
+
+
+def _until(condition: Callable[[], bool], timeout_s: float, pause_s: float = 0.05) -> float:
+    """Return the seconds until ``condition`` held.
+
+    Raises:
+        GoalNotReachedError: it did not in time.
+    """
+    begin_s = time.monotonic()
+    while not condition():
+        if time.monotonic() - begin_s > timeout_s:
+            raise GoalNotReachedError(f"bench station: not reached within {timeout_s:g} s")
+        time.sleep(pause_s)
+    return time.monotonic() - begin_s
+
+
+def _load(ground: Ground, load: Load, seconds: float, tell: Callable[[str], None]) -> dict[str, float]:
+    _until(ground.served, 30.0)
+    health: dict[str, Health] = {}
+
+    def take(message: Health) -> None:
+        health[message.service] = message
+
+    with opened_client(ground.endpoint, lambda: False, wait_s=10.0) as session:
+        bus = Bus(session, "uav1", HealthBook())
+        bus.subscribe(HEALTH, take)
+
+        def counted() -> int:
+            while (taken := bus.inbox.take()) is not None:
+                taken[0].handler(taken[1])
+            return health["station"].counters.get("messages", 0) if "station" in health else -1
+
+        load.go(on=True)
+        _until(lambda: counted() > 500, 30.0)
+        load.go(on=False)
+        time.sleep(2.5)
+        sent, before = load.sent, counted()
+        page = psutil.Process(ground.processes["station"].pid)
+        cpu_s, begin_s = sum(page.cpu_times()[:2]), time.monotonic()
+        load.go(on=True)
+        fps = _frame_rate(ground, seconds)
+        load.go(on=False)
+        used_s, took_s = sum(page.cpu_times()[:2]) - cpu_s, time.monotonic() - begin_s
+        time.sleep(2.5)
+        lost = (load.sent - sent) - (counted() - before)
+        load.go(on=True)
+        figures = {
+            "messages_sent": load.sent - sent, "messages_lost": lost, "cpu_cores": round(used_s / took_s, 3),
+            "memory_mb": round(page.memory_info().rss / 1e6, 1), "rate_hz": round((load.sent - sent) / took_s / 5 / _AIRCRAFT, 2),
+        }  # fmt: skip
+    if fps is not None:
+        figures["page_fps"] = round(fps, 1)
+    tell(f"load: {figures}")
+    return figures
+
+
+def _frame_rate(ground: Ground, seconds: float) -> float | None:
+    """Keep a page open for ``seconds``; return its frames per second in Chromium, None where there is none."""
+    end_s = time.monotonic() + seconds
+    try:
+        import shutil
+
+        from playwright.sync_api import sync_playwright
+
+        path = shutil.which("chromium")
+        if path is None:
+            raise ImportError("no chromium")
+        with sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", "--disable-gpu"])
+            page = browser.new_page(viewport={"width": 1024, "height": 768})
+            page.goto(ground.address)
+            page.wait_for_timeout(2_000)
+            before, begin_s = page.evaluate("window.treedock.frames"), time.monotonic()
+            page.wait_for_timeout(max(1.0, end_s - time.monotonic()) * 1e3)
+            fps = (page.evaluate("window.treedock.frames") - before) / (time.monotonic() - begin_s)
+            browser.close()
+            return float(fps)
+    except ImportError:
+        page_without_browser = Page(ground)
+        while time.monotonic() < end_s:
+            page_without_browser.hear(2.0)
+        page_without_browser.close()
+        return None
+
+
+def _right_after(ground: Ground, timeout_s: float = 20.0) -> float:
+    """Return the seconds until a page that opens now shows everything, trying again as the page itself does."""
+    from websockets.exceptions import WebSocketException
+
+    begin_s = time.monotonic()
+    while time.monotonic() - begin_s < timeout_s:
+        with suppress(OSError, TimeoutError, WebSocketException):
+            page = Page(ground)
+            try:
+                while not page.right(_AIRCRAFT, _TREES):
+                    page.hear(1.0)
+                return time.monotonic() - begin_s
+            finally:
+                page.close()
+        time.sleep(0.1)
+    raise GoalNotReachedError(f"bench station: the page was not right within {timeout_s:g} s")
+
+
+def _restarts(ground: Ground, load: Load, tell: Callable[[str], None]) -> dict[str, float]:
+    figures = {"reopened_s": _right_after(ground)}
+    ground.kill("station")
+    ground.start("station")
+    figures["station_restart_s"] = _right_after(ground)
+    ground.kill("router")
+    time.sleep(1.0)
+    ground.start("router")
+    figures["router_restart_s"] = _right_after(ground)
+    time.sleep(2.0)
+    load.go(on=False)
+    time.sleep(2.0)
+    trees = _present(ground.database)
+    figures["trees_lost"] = max(0, _AIRCRAFT * _TREES - trees)
+    figures["trees_doubled"] = max(0, trees - _AIRCRAFT * _TREES)
+    figures["database_mb"] = round(ground.database.stat().st_size / 1e6, 1)
+    tell(f"restarts: {figures}")
+    return {name: round(value, 2) for name, value in figures.items()}
+
+
+def _present(path: Path) -> int:
+    db = sqlite3.connect(path)
+    try:
+        return int(db.execute("SELECT count(*) FROM trees_local WHERE status = 'present'").fetchone()[0])
+    finally:
+        db.close()
+
+
+def _power_cuts(
+    ground: Ground, load: Load, kills: int, rng: np.random.Generator, tell: Callable[[str], None]
+) -> dict[str, float]:
+    """Kill the station again and again while it writes; each time the file must open and hold all but the last second."""
+    broken, missing_s = 0, [0.0]
+    aircraft = load.aircraft[0]
+    load.go(on=True)
+    for number in range(kills):
+        ground.start("station")
+        _until(ground.served, 30.0)
+        since_s = time.monotonic()
+        _until(lambda since_s=since_s: _version(ground.database) >= _sent_by(aircraft.told, since_s), 20.0)  # type: ignore[misc]
+        time.sleep(float(rng.uniform(0.0, 1.2)))
+        ground.kill("station")
+        killed_s = time.monotonic()
+        kept = _version(ground.database)
+        sound = _sound(ground.database)
+        broken += not sound
+        first_lost_s = next((at for at, version in aircraft.told if version > kept), killed_s)
+        missing_s.append(max(0.0, killed_s - first_lost_s))
+        if not sound or number % 10 == 9:
+            tell(f"power cut {number + 1} of {kills}: {broken} broken, at most {max(missing_s):.2f} s missing")
+    late = sum(s > _MOST_LOST_S for s in missing_s)
+    return {"kills": kills, "files_broken": broken, "missing_s_max": round(max(missing_s), 2), "missing_over_1_s": late}
+
+
+def _sent_by(told: list[tuple[float, int]], at_s: float) -> int:
+    return max((version for when, version in told if when <= at_s), default=0)
+
+
+def _version(path: Path) -> int:
+    """Return the version of the newest list in the file, 0 for none."""
+    if not path.exists():
+        return 0
+    db = sqlite3.connect(path)
+    try:
+        found = db.execute("SELECT max(version) FROM flights").fetchone()[0]
+    except sqlite3.OperationalError:  # killed before its tables were made
+        return 0
+    finally:
+        db.close()
+    return int(found or 0)
+
+
+def _sound(path: Path) -> bool:
+    db = sqlite3.connect(path)
+    try:
+        whole = db.execute("PRAGMA integrity_check").fetchone()[0] == "ok"
+        trees = db.execute("SELECT count(*) FROM trees_local WHERE status = 'present'").fetchone()[0]
+        return bool(whole and trees in (0, 50))
+    except sqlite3.DatabaseError:
+        return False
+    finally:
+        db.close()
+
+
+_ROWS = (
+    ("messages lost of those sent", "messages_lost", "0"), ("station CPU, cores", "cpu_cores", "<= 0.5"),
+    ("station memory, MB", "memory_mb", ""), ("page frame rate in Chromium, 1/s", "page_fps", ""),
+    ("page right after it was opened, s", "reopened_s", "<= 3"), ("after the station was restarted, s", "station_restart_s", "<= 3"),
+    ("after the router was restarted, s", "router_restart_s", "<= 3"), ("trees lost", "trees_lost", "0"),
+    ("trees doubled", "trees_doubled", "0"), ("files broken by kill -9", "files_broken", "0"),
+    ("most that was missing after it, s", "missing_s_max", "<= 1"),
+)  # fmt: skip
+
+
+def _table(figures: dict[str, float]) -> str:
+    lines = ["| | measured | wanted |", "|---|---|---|"]
+    lines += [f"| {words} | {figures[name]:g} | {wanted} |" for words, name, wanted in _ROWS if name in figures]
+    return "\n".join(lines)
