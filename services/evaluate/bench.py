@@ -19,6 +19,7 @@ BENCHES: dict[str, str] = {
     "mapper": "services.evaluate.bench_mapper",
     "peers": "services.evaluate.bench_peers",
     "slam": "services.evaluate.bench_slam",
+    "slam-long": "services.evaluate.bench_slam_long",
     "refine": "services.evaluate.bench_refine",
     "latency": "services.evaluate.bench_latency",
     "depth": "services.evaluate.bench_depth",
