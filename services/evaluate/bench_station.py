@@ -197,7 +197,8 @@ def _load(ground: Ground, load: Load, seconds: float, tell: Callable[[str], None
         }  # fmt: skip
     if fps is not None:
         figures["page_fps"] = round(fps, 1)
-    tell(f"load: {figures}")
+    dropped = {k: n for k, n in health["station"].counters.items() if k.startswith(("dropped", "decode"))}
+    tell(f"load: {figures}, the station's own count of gaps: {dropped or 'none'}")
     return figures
 
 

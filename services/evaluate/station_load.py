@@ -141,10 +141,10 @@ class Load:
         next_s = time.monotonic()
         while not self._over.is_set():
             self._running.wait()
-            next_s = max(next_s + self._period_s, time.monotonic() - self._period_s)
-            for aircraft in self.aircraft:
+            for aircraft in self.aircraft:  # one after the other: aircraft do not speak in step
+                next_s = max(next_s + self._period_s / len(self.aircraft), time.monotonic() - self._period_s)
+                time.sleep(max(0.0, next_s - time.monotonic()))
                 if self._over.is_set():
                     return
                 aircraft.tick(self._step)
             self._step += 1
-            time.sleep(max(0.0, next_s - time.monotonic()))

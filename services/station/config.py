@@ -38,6 +38,10 @@ class StationConfig(BaseModel):
     """An operator whose browser is gone stays in command for this long."""
     command_timeout_s: float = Field(default=2.0, gt=0.0)
     """The longest wait for the aircraft's answer; it is asked twice, for a nonce and with the command."""
+    any_port: bool = False
+    """Take any free port when ``port`` is in use, in place of refusing to start."""
+    address_file: str = ""
+    """Write the page's address into this file once it is served."""
     open_browser: bool = False
     """Open the page in this machine's browser at the start."""
     cloud: bool = False

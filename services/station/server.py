@@ -20,8 +20,8 @@ LOG = logging.getLogger(__name__)
 _STOP_WITHIN_S = 0.4
 
 
-def bound_socket(host: str, port: int) -> socket.socket:
-    """Return a socket bound to the page's address.
+def bound_socket(host: str, port: int, *, any_port: bool = False) -> socket.socket:
+    """Return a socket bound to the page's address; with ``any_port`` to another port where this one is in use.
 
     Raises:
         InputError: the address is not ours or the port is taken.
@@ -33,6 +33,8 @@ def bound_socket(host: str, port: int) -> socket.socket:
         bound.bind((host, port))
     except OSError as error:
         bound.close()
+        if any_port and port:
+            return bound_socket(host, 0)
         raise InputError(
             f"the page cannot be served on {host} port {port}: {error.strerror}; choose others with --host and --page-port"
         ) from error

@@ -6,12 +6,16 @@ pool. What passes between them goes through the inbox, so that one thread alone 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 import secrets
+import socket
 import time
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import zenoh
@@ -33,6 +37,7 @@ from services.station.aircraft import Aircraft
 from services.station.brain import Brain, Outgoing
 from services.station.events import Event
 from services.station.guard import Guard
+from services.station.launch import open_browser
 from services.station.preview import frame_of, jpeg_fault
 from services.station.requests import Request
 from services.station.server import WebServer, bound_socket
@@ -65,7 +70,7 @@ class Station:
         token = self._token()
         self.site = Site(self.config, Guard(token, local=self.config.local), _Ears(self), self._downloads())
         self.brain = Brain(self.config, self.site, self._send_order, time.time_ns)
-        self._server = WebServer(self.site, self.config, bound_socket(self.config.host, self.config.port))
+        self._server = WebServer(self.site, self.config, self._bound())
         self.address = self._address(token)
 
     def _token(self) -> str:
@@ -73,6 +78,19 @@ class Station:
         if self.config.local or self.config.tls_client_ca:
             return self.config.token
         return self.config.token or secrets.token_urlsafe(24)
+
+    def _bound(self) -> socket.socket:
+        return bound_socket(self.config.host, self.config.port, any_port=self.config.any_port)
+
+    def _tell_address(self) -> None:
+        LOG.info("the page is at %s", self.address)
+        if self.config.address_file:
+            path = Path(self.config.address_file)
+            with contextlib.suppress(OSError):  # who waits for it goes on without
+                path.touch(mode=0o600)  # it may hold the token
+                path.write_text(self.address)
+        if self.config.open_browser:
+            open_browser(self.address)
 
     # -- the inventory
 
@@ -133,7 +151,7 @@ class Station:
             self.brain.log.listeners.append(self._audit)
             self.keeper.start()
         self._server.start()
-        LOG.info("the page is at %s", self.address)
+        self._tell_address()
 
     def call(self, action: Callable[[], None]) -> None:
         """Have the work loop call ``action``; from any thread."""
@@ -237,10 +255,13 @@ class Station:
 
     def _each_second(self) -> None:
         self.brain.tell_trees()
-        for uav, bus in self._buses.items():
+        passed: Counter[str] = Counter()
+        for bus in self._buses.values():
             bus.count_overflows()
+            passed += bus.passed
+        health = self._reporter.report(self._context.wall.now_ns(), passed)
+        for uav, bus in self._buses.items():
             if uav != self._context.uav:  # the runtime tells that one itself
-                health = self._reporter.report(self._context.wall.now_ns(), bus.passed)
                 bus.publish(HEALTH, health, "station")
         self._context.health.counters["pages"] = len(self.brain.sessions)
         self._context.health.counters["refused_requests"] = self.brain.refused
