@@ -70,13 +70,17 @@ def recover_folder(folder: Path) -> list[Recovered]:
     Raises:
         InputError: a mended file cannot be written.
     """
-    done = []
+    return [recover(path) for path in cut_recordings(folder)]
+
+
+def cut_recordings(folder: Path) -> list[Path]:
+    """Return the recordings of a folder that lack their end and that nobody is writing."""
+    found = []
     for path in sorted(folder.glob("*.mcap")):
         with path.open("rb") as stream:
-            if _ends_well(stream) or _is_being_written(stream):
-                continue
-        done.append(recover(path))
-    return done
+            if not (_ends_well(stream) or _is_being_written(stream)):
+                found.append(path)
+    return found
 
 
 def _is_being_written(stream: BinaryIO) -> bool:

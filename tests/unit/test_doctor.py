@@ -1,0 +1,101 @@
+"""The doctor: each trouble gives its finding with what to do, a sound machine none."""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from services.cli.app import invoke
+from services.common.config import TreedockConfig
+from services.doctor.facts import gather
+from services.doctor.findings import Facts, ServiceFact, judge
+from services.recorder.config import RecorderConfig
+from services.security.authority import Authority
+from services.security.identity import Identity
+
+CAMERA = ServiceFact(
+    "camera", "ready", 10, "", 0.2, {"camera/rgbd": 15.0}, locked_bytes=50_000_000, clock_offset_s=0.001
+)
+SLAM = ServiceFact("slam", "ready", 11, "", 0.2, {"slam/pose": 15.0}, clock_offset_s=0.001)
+SOUND = Facts(
+    router="tcp/127.0.0.1:7447", wanted_router="tcp/127.0.0.1:7447", services=(CAMERA, SLAM),
+    units={"treedock-slam.service": "active"}, clock_synchronised=True, locked_limit_bytes=-1, shm_free_bytes=10**10,
+    disk_free_bytes=10**11, camera="realsense: 4 video devices", source="realsense", calibration_days=20.0,
+)  # fmt: skip
+ENCRYPTED = replace(SOUND, encrypted=True, certificates={"uav1.slam": 200.0}, reachable_from_outside=True)
+
+
+def test_a_sound_machine_has_no_trouble() -> None:
+    for facts in (SOUND, ENCRYPTED):
+        assert {finding.level for finding in judge(facts)} == {"ok"}
+
+
+@pytest.mark.parametrize(
+    ("facts", "about", "level", "word"),
+    [
+        (replace(SOUND, router=None, services=()), "router", "fail", "7447"),
+        (replace(SOUND, services=()), "services", "warn", "no service"),
+        (replace(SOUND, units={"treedock-slam.service": "failed"}), "units", "fail", "treedock-slam"),
+        (replace(SOUND, units={"treedock-slam.service": "inactive"}), "units", "warn", "stopped"),
+        (replace(SOUND, units={}), "units", "unknown", "no treedock unit"),
+        (replace(SOUND, services=(replace(SLAM, age_s=9.0),)), "slam", "fail", "silent"),
+        (replace(SOUND, services=(replace(SLAM, state="degraded", note="lost"),)), "slam", "warn", "lost"),
+        (replace(SOUND, services=(replace(SLAM, rates_hz={"slam/pose": 4.0}),)), "slam/pose", "warn", "4.0 Hz, 15"),
+        (replace(SOUND, services=(replace(CAMERA, locked_bytes=0),)), "shared memory", "warn", "shared memory is off"),
+        (replace(SOUND, services=(replace(SLAM, clock_offset_s=0.2),)), "clock", "warn", "+200 ms"),
+        (replace(SOUND, clock_synchronised=False), "clock", "warn", "not synchronised"),
+        (replace(SOUND, shm_free_bytes=10**6), "shared memory", "fail", "/dev/shm"),
+        (replace(SOUND, services=(), locked_limit_bytes=8_000_000), "shared memory", "warn", "8000 KB"),
+        (replace(SOUND, disk_free_bytes=10**8), "disk", "fail", "0.1 GB"),
+        (replace(SOUND, disk_free_bytes=2 * 10**9), "disk", "warn", "2.0 GB"),
+        (replace(SOUND, recordings_cut=("a.mcap",)), "recordings", "warn", "1 recording"),
+        (replace(SOUND, camera=None), "camera", "fail", "not found"),
+        (replace(SOUND, calibration_days=400.0), "calibration", "warn", "400 days"),
+        (replace(SOUND, reachable_from_outside=True), "encryption", "fail", "anybody"),
+        (replace(ENCRYPTED, certificates={"uav1.slam": 12.0}), "certificate", "warn", "12 days"),
+        (replace(ENCRYPTED, certificates={"uav1.slam": -3.0}), "certificate", "fail", "3 days ago"),
+        (replace(ENCRYPTED, loose_keys=("/etc/x.key",)), "keys", "fail", "/etc/x.key"),
+    ],
+)
+def test_each_trouble_has_its_finding_and_what_to_do(facts: Facts, about: str, level: str, word: str) -> None:
+    found = [finding for finding in judge(facts) if finding.about == about and finding.level == level]
+    assert len(found) == 1
+    assert word in found[0].text
+    assert found[0].do
+
+
+def test_a_machine_is_really_looked_at(tmp_path: Path) -> None:
+    now = dt.datetime.now(dt.UTC)
+    authority = Authority.create(tmp_path, now)
+    for name in ("uav1.slam", "uav1.reader"):
+        authority = authority.issue(Identity.parse(name), now, days=10)
+    (tmp_path / "uav1.slam.key").chmod(0o644)
+    recordings = tmp_path / "recordings"
+    recordings.mkdir()
+    (recordings / "a.mcap").write_bytes(b"\x89MCAP0\r\n")
+    config = TreedockConfig.model_validate({
+        "router": {"protocol": "tls", "port": 1}, "security": {"folder": tmp_path},
+        "recorder": RecorderConfig(folder=recordings), "camera": {"source": "tum:/nowhere"},
+    })  # fmt: skip
+    facts = gather(config)
+    assert facts.router is None
+    assert facts.certificates["uav1.slam"] == pytest.approx(10.0, abs=0.1)
+    assert facts.loose_keys == [str(tmp_path / "uav1.slam.key")]
+    assert facts.recordings_cut == [str(recordings / "a.mcap")]
+    assert facts.camera is None
+    assert facts.disk_free_bytes is not None
+
+
+def test_fix_mends_and_the_report_is_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "cut.mcap").write_bytes(b"\x89MCAP0\r\n")
+    code = invoke(["doctor", "--fix", "--json", "--set", f"recorder.folder={tmp_path}", "--port", "1"])
+    said = capsys.readouterr()
+    report = json.loads(said.out)
+    assert code == 3, "no router"
+    assert report["fit"] is False
+    assert "cut.mcap" in said.err
+    assert not any(finding["about"] == "recordings" for finding in report["findings"])
