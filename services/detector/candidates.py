@@ -231,18 +231,34 @@ def _as_trunk(candidate: Candidate, around: Surroundings) -> Trunk:
     axis = c.axis @ frame.R
     axis = axis / np.linalg.norm(axis)
     base = frame.to_input(candidate.base)
-    at_radius = np.array([0.0, 0.0, 0.0, 0.0, 1.0, along])
-    down = candidate.base[2] - c.at_m[2]
-    A = np.array([[1.0, 0.0, down, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, down, 0.0, 0.0]])
-    sigma_xy = float(np.sqrt(max(np.linalg.eigvalsh(A @ c.covariance @ A.T)[-1], 0.0)))
+    sigma_xy, sigma_radius = _doubts(candidate, along, radius, around.config)
     remark = _unsuitable(radius, lean, candidate.fork_m, around.config)
     return Trunk(
         base_m=(float(base[0]), float(base[1]), float(base[2])), axis=(float(axis[0]), float(axis[1]), float(axis[2])),
         radius_m=radius, radius_height_m=height, taper=c.taper, height_seen_m=candidate.top_m, low_seen_m=candidate.low_m,
-        sigma_xy_m=sigma_xy, sigma_radius_m=float(np.sqrt(max(at_radius @ c.covariance @ at_radius, 0.0))),
+        sigma_xy_m=sigma_xy, sigma_radius_m=sigma_radius,
         arc_rad=c.arc_rad, confidence=_confidence(candidate), layers=round((candidate.high_m - candidate.low_m) / 0.1),
         points=c.points, noise_m=c.noise_m, lean_rad=lean, suitable=not remark, remark=remark,
+        range_m=c.range_m,
     )  # fmt: skip
+
+
+def _doubts(candidate: Candidate, along: float, radius: float, config: DetectorConfig) -> tuple[float, float]:
+    """Return the standard deviations of the base per axis and of the radius.
+
+    Three parts that do not know of each other: the fit's own (noise, which many points average), the shape's, which stays
+    however many points show one side, and for the place the map's drift.
+    """
+    c = candidate.cylinder
+    at_radius = np.array([0.0, 0.0, 0.0, 0.0, 1.0, along])
+    down = candidate.base[2] - c.at_m[2]
+    A = np.array([[1.0, 0.0, down, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, down, 0.0, 0.0]])
+    fit_xy = 0.5 * float(np.trace(A @ c.covariance @ A.T))
+    fit_radius = float(at_radius @ c.covariance @ at_radius)
+    one_sided = 1.0 - 0.5 * c.arc_rad / np.pi
+    shape_xy, shape_radius = config.off_centre * radius, config.out_of_round * radius
+    sigma_xy = np.sqrt(max(fit_xy, 0.0) + (one_sided + 0.1) * shape_xy**2 + config.map_drift_m**2)
+    return float(sigma_xy), float(np.sqrt(max(fit_radius, 0.0) + (one_sided + 0.1) * shape_radius**2))
 
 
 def _unsuitable(radius: float, lean: float, fork_m: float | None, config: DetectorConfig) -> str:

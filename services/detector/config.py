@@ -44,6 +44,12 @@ class DetectorConfig(BaseModel):
     """Depth noise at one metre, growing with the square of range: s/(f B) = 0.08 px / (565 px * 0.070 m)."""
     surface_noise_m: float = 0.006
     """Bark, registration and quantisation: noise of a surface point whatever the range."""
+    out_of_round: float = Field(default=0.026, ge=0.0)
+    """Share of the radius by which the side that shows differs from the whole trunk; more points do not tell."""
+    off_centre: float = Field(default=0.033, ge=0.0)
+    """The same for each coordinate of the axis: bark, flare and the pattern that the sensor repeats in every frame."""
+    map_drift_m: float = Field(default=0.0, ge=0.0)
+    """Error of the map itself per axis, where poses are slam's: no detection in that map can tell it."""
     post_top_m: float = 2.5
     """A column that ends below this height above ground, with the space above it seen empty, is no tree."""
     trials: int = Field(default=48, gt=0)

@@ -23,7 +23,7 @@ _PRIOR_SLOPE = 0.02
 _PRIOR_TAPER = 0.008
 """Standard deviation of the taper about its mean, metres of radius per metre of height."""
 _MEAN_TAPER = -0.006
-_CORRELATED = 25.0
+_CORRELATED = 12.0
 """Neighbouring points share fixed-pattern noise and bark: so many of them count as one in the covariance."""
 
 
@@ -75,11 +75,14 @@ class _Fit:
     normal: Floats
 
 
-def _priors(radius: float) -> Floats:
-    """Return mean and inverse variance of (x, y, slope x, slope y, radius, taper) in the axis frame of a candidate."""
+def _priors(radius: float, share: float = 1.0) -> Floats:
+    """Return mean and inverse variance of (x, y, slope x, slope y, radius, taper) in the axis frame of a candidate.
+
+    ``share`` of the usual deviation of the radius.
+    """
     slope = 1.0 / (4 * _PRIOR_SLOPE) ** 2
     return np.array([
-        [0.0, 1e-6], [0.0, 1e-6], [0.0, slope], [0.0, slope], [radius, 1.0 / (0.12 * radius + 0.006) ** 2],
+        [0.0, 1e-6], [0.0, 1e-6], [0.0, slope], [0.0, slope], [radius, 1.0 / (share * (0.12 * radius + 0.006)) ** 2],
         [_MEAN_TAPER, 1.0 / _PRIOR_TAPER**2],
     ])  # fmt: skip
 
@@ -98,6 +101,8 @@ def fit_cylinder(voxels: Voxels, stack: Stack, config: DetectorConfig) -> Cylind
     """Return the joint fit of a candidate, or None when too few points remain or it leaves its slices."""
     if voxels.seen_from:
         found = _fitted(voxels, voxels.ray_m, stack, config, 1.0, _priors(stack.radius_m))
+        if found is None:  # plants beside the trunk pulled it away: nearer to the slices, whose median they do not move
+            found = _fitted(voxels, voxels.ray_m, stack, config, 1.0, _priors(stack.radius_m, 0.5), 0.5)
         return None if found is None else _measured(found, config)
     # without views the noise is not known beforehand
     found = _fitted(voxels, voxels.ray_m, stack, config, 3.0, _priors(stack.radius_m))
@@ -108,12 +113,12 @@ def fit_cylinder(voxels: Voxels, stack: Stack, config: DetectorConfig) -> Cylind
 
 
 def _fitted(
-    voxels: Voxels, ray: Floats, stack: Stack, config: DetectorConfig, start: float, prior: Floats
+    voxels: Voxels, ray: Floats, stack: Stack, config: DetectorConfig, start: float, prior: Floats, reach: float = 1.0
 ) -> _Fit | None:  # fmt: skip
     at, slope = stack.at_m.copy(), stack.slope.copy()
     normal, x = np.zeros((6, 6)), np.zeros(6)
     scale, P, U, G = fit_axis(
-        voxels.xyz_m, ray, at, slope, stack.radius_m, _margin_m(stack, config), stack.z_low_m - 0.15,
+        voxels.xyz_m, ray, at, slope, stack.radius_m, reach * _margin_m(stack, config), stack.z_low_m - 0.15,
         stack.z_high_m + 0.15, start, _CORRELATED, config.range_noise_per_m, config.surface_noise_m, prior, normal, x,
     )  # fmt: skip
     return None if scale < 0.0 else _Fit(P, U, G, x, float(scale), at, slope, normal)

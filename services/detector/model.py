@@ -98,6 +98,8 @@ class Trunk:
     suitable: bool
     remark: str
     """Why it is not suitable; empty otherwise."""
+    range_m: float = 0.0
+    """Mean distance that its points were seen from; 0 where that is unknown."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -139,7 +139,7 @@ def _conditions(options: BenchOptions) -> dict[str, str]:
     return {
         "sensor": "simulated RGB-D depth, 640x480, keyframes every 0.3 m or 15 degrees of the reference path, fused by the mapper's core",
         "noise": "sigma_z = z^2 s / (f B), s 0.08 px, f 565 px, B 0.070 m, partly fixed pattern, mixed pixels, holes",
-        "poses": "true; drift: lean 0.57 deg per axis, 1 cm and 0.14 deg slow, 2 mm and 0.03 deg white (standard deviations)",
+        "poses": "true; drift: lean 0.74 deg per axis, 6 mm and 0.14 deg slow, 2 mm and 0.03 deg white (standard deviations)",
         "scenes": names,
         "found": "axis within 0.30 m at the ground and radius within 0.07 m, of suitable trees seen at least 12 px wide and unhidden",
         "times": "two threads; other work on this machine shows in the load: the least and the processor time suffer less than the median",

@@ -50,15 +50,15 @@ _FUSION = (
 class Drift:
     """Errors of keyframe poses, as measured of slam on rendered flights (docs/decisions/chain-errors.md)."""
 
-    tilt_rad: float = 0.010
+    tilt_rad: float = 0.013
     """Standard deviation of the map's lean, per horizontal axis."""
-    slow_m: float = 0.010
+    slow_m: float = 0.006
     """Of the position's slow wandering, per axis."""
     slow_rad: float = 0.0025
     """Of the yaw's slow wandering."""
     white_m: float = 0.002
     white_rad: float = 0.0006
-    memory: float = 0.85
+    memory: float = 0.93
     """Correlation of the slow part from one keyframe to the next."""
 
 
@@ -184,7 +184,7 @@ def _cached_shots(name: str, cache: Path) -> _Shots:
             return _Shots(held["depth"], held["poses"], trees)
     shots = _render(name)
     trees_text = json.dumps([tree.model_dump_json() for tree in shots.trees])
-    _save(path, depth=shots.depth, poses=shots.poses, trees=np.array(trees_text))
+    _save(path, small=True, depth=shots.depth, poses=shots.poses, trees=np.array(trees_text))
     return shots
 
 
@@ -217,12 +217,12 @@ def _render(name: str) -> _Shots:
     return _Shots(np.stack(depth), placed, truth_trees(world.scene, T_world_map, fair_trees(world, path)))
 
 
-def _save(path: Path, **arrays: NDArray[np.generic]) -> None:
-    """Write the whole file or nothing."""
+def _save(path: Path, *, small: bool = False, **arrays: NDArray[np.generic]) -> None:
+    """Write the whole file or nothing; ``small`` takes the time to compress."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.partial")
     with partial.open("wb") as stream:
-        np.savez_compressed(stream, allow_pickle=False, **arrays)
+        (np.savez_compressed if small else np.savez)(stream, allow_pickle=False, **arrays)
     partial.replace(path)
 
 
