@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import struct
 import time
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from services.slam.config import SlamConfig
 from services.slam.features import Features, grid_of, grid_size
 from services.slam.links import Keyframes, Points, describe, observe
 from services.slam.slam import Slam
-from services.slam.store import BEAT, KEYFRAME, Arrays, Header, Store, StoredKeyframe, encode_keyframe
+from services.slam.store import BEAT, KEYFRAME, TAKEN, Arrays, Header, Log, Store, StoredKeyframe, encode_keyframe
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
@@ -26,6 +27,7 @@ I32 = NDArray[np.int32]
 _WHOLE_NS = 5_000_000_000
 """The map as a whole is written so often while keyframes come, and at once when its frame has changed."""
 _BEAT_NS = 5_000_000_000
+_AGAIN, _AGAIN_NS = 3, 60_000_000_000
 _VERSIONS_LOST = 1000
 _RESETS_LOST = 16
 """More graphs and jumps than can have been told after the last that was written."""
@@ -85,6 +87,7 @@ class Keeper:
     def resume(self, slam: Slam) -> None:
         """Go on with a map that was taken up again."""
         self._slam, self._era = slam, slam.era
+        self._guarded(lambda: self._store.mark(TAKEN, since_boot_ns()))
         slam.on_made, slam.on_settled = self.made, self.settled
 
     def made(self, k: int) -> None:
@@ -116,10 +119,10 @@ class Keeper:
     def beat(self) -> None:
         """Say now and then that the map still lives."""
         slam, now = self._slam, since_boot_ns()
-        if slam is None or self.fault or now - self._beat_ns < _BEAT_NS:
-            return
+        if slam is None or self.fault or now - self._beat_ns < _BEAT_NS or not slam.crew.idle:
+            return  # a busy crew writes keyframes
         self._beat_ns = now
-        slam.crew.submit(lambda: self._guarded(lambda: self._store.append(BEAT, struct.pack("<Q", now))))
+        slam.crew.submit(lambda: self._guarded(lambda: self._store.mark(BEAT, now)))
 
     def let_go(self) -> None:
         """Keep this map no longer."""
@@ -156,11 +159,11 @@ def whole_map(slam: Slam) -> Arrays:
     """Return the map without its keyframes' features: what mapping has made of them."""
     points, kf, slots = slam.atlas.points, slam.atlas.keyframes, slam.atlas.slots
     ids = np.flatnonzero(points.n)
-    seen = np.arange(points.frame.shape[1])[None, :] < points.n[ids][:, None]
+    frame, feature = observations(points, ids)
     return {
         "serial": kf.serial[slots], "R": kf.R[slots], "t": kf.t[slots],
         "pos": points.pos[ids], "born": points.born[ids], "found": points.found[ids], "visible": points.visible[ids],
-        "n": points.n[ids], "frame": kf.serial[points.frame[ids][seen]], "feature": points.feature[ids][seen],
+        "n": points.n[ids], "frame": kf.serial[frame], "feature": feature,
         "numbers": np.array([slam.era, slam.graph_version, slam.reset_counter, since_boot_ns(),
                              slam.atlas.newest_serial]),
         "up_sigma_rad": np.array(slam.up_sigma_rad),
@@ -168,18 +171,37 @@ def whole_map(slam: Slam) -> Arrays:
 
 
 def take_up(store: Store, slam: Slam, max_age_s: float) -> str:
-    """Fill a fresh ``slam`` with the map on disk; return why not, or an empty text. ``slam.map_id`` is then the old one's."""
-    header, keyframes, last_ns = store.read()
-    if header is None or not keyframes:
+    """Fill a fresh ``slam`` with the map on disk; return why not, or an empty text. ``slam.map_id`` is then the old one's.
+
+    When the text is not empty ``slam`` may be half filled: to be thrown away.
+    """
+    try:
+        log = store.read()
+        return _unfit(log, slam, max_age_s) or _restore(log, store.read_map(), slam)
+    except (ValueError, LookupError, TypeError, struct.error, zipfile.BadZipFile) as error:
+        return f"the map on disk cannot be read ({error})"
+
+
+def _unfit(log: Log, slam: Slam, max_age_s: float) -> str:
+    """Return why this map is not ours to take up, or an empty text."""
+    now_ns = since_boot_ns()
+    age_s = (now_ns - log.last_ns) * 1e-9
+    if log.header is None or not log.keyframes:
         return "no map is kept"
-    age_s = (since_boot_ns() - last_ns) * 1e-9
-    if header.boot != boot_id():
+    if log.header.boot != boot_id():
         return "the map on disk is from before the machine's last start"
     if not 0.0 <= age_s <= max_age_s:
         return f"the map on disk is {age_s:.0f} s old, more than {max_age_s:g} s (slam.map_max_age_s)"
-    if header.camera != shape_of(slam.intrinsics, slam.config):
+    if log.header.camera != shape_of(slam.intrinsics, slam.config):
         return "the map on disk is another camera's"
-    whole = store.read_map()
+    if sum(now_ns - taken_ns < _AGAIN_NS for taken_ns in log.taken_ns) >= _AGAIN:
+        return f"the map on disk was taken up {_AGAIN} times within a minute: it may be what ends slam"
+    return ""
+
+
+def _restore(log: Log, whole: Arrays, slam: Slam) -> str:
+    """Put the map together; return why that failed, or an empty text."""
+    keyframes = log.keyframes
     era, version, resets, _, newest = (int(x) for x in whole["numbers"]) if whole else (0, 0, 0, 0, -1)
     by_serial = {k.serial: k for k in keyframes}
     placed = _restore_whole(slam, whole, by_serial) if whole else 0
@@ -191,7 +213,8 @@ def take_up(store: Store, slam: Slam, max_age_s: float) -> str:
     slam.atlas.next_serial(max(newest, *by_serial) + 1)
     version = max(version, *(k.graph_version for k in keyframes))
     sigma = float(whole["up_sigma_rad"]) if whole else slam.up_sigma_rad
-    slam.resume(header.map_id, version + _VERSIONS_LOST, (resets + _RESETS_LOST) % 256, sigma, era)
+    assert log.header is not None
+    slam.resume(log.header.map_id, version + _VERSIONS_LOST, (resets + _RESETS_LOST) % 256, sigma, era)
     return ""
 
 
@@ -238,6 +261,21 @@ def _features(slam: Slam, columns: Arrays) -> Features:
         uv, columns["octave"].astype(np.int32), columns["angle"].astype(float), columns["desc"].copy(), depth,
         disparity, columns["far"].copy(), columns["info"].astype(float), start, items,
     )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def observations(points: Points, ids: NDArray[np.int64]) -> tuple[I32, I32]:
+    """Return keyframe slot and feature of all observations of points ``ids``, in one row."""
+    total = 0
+    for p in ids:
+        total += points.n[p]
+    frame, feature = np.empty(total, np.int32), np.empty(total, np.int32)
+    at = 0
+    for p in ids:
+        for j in range(points.n[p]):
+            frame[at], feature[at] = points.frame[p, j], points.feature[p, j]
+            at += 1
+    return frame, feature
 
 
 @njit(cache=True, nogil=True)

@@ -13,7 +13,7 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from io import BytesIO
 from pathlib import Path
 
@@ -25,10 +25,11 @@ from services.common.files import make_folder, write_whole
 F64 = NDArray[np.float64]
 Arrays = dict[str, NDArray]
 
-HEADER, KEYFRAME, BEAT = b"H", b"K", b"B"
+HEADER, KEYFRAME, BEAT, TAKEN = b"H", b"K", b"B", b"T"
 FORMAT = 1
 _MAGIC = b"\x9dTDK"
 _HEAD = struct.Struct("<4sccxxII")
+_CLOCK = struct.Struct("<Q")
 _NUMBERS = struct.Struct("<iiiqQ12d")
 _COLUMNS = (
     ("uv", np.float32, 2), ("octave", np.uint8, 0), ("angle", np.float32, 0), ("desc", np.uint64, 4),
@@ -102,6 +103,18 @@ def records(data: bytes) -> Iterator[tuple[bytes, bytes]]:
             at = data.find(_MAGIC, at + 1)
 
 
+@dataclass(slots=True)
+class Log:
+    """What a log was found to hold."""
+
+    header: Header | None = None
+    keyframes: list[StoredKeyframe] = field(default_factory=list)
+    last_ns: int = 0
+    """The latest sign of life, clock since boot."""
+    taken_ns: list[int] = field(default_factory=list)
+    """When the map was taken up again."""
+
+
 class Store:
     """The two files of one folder."""
 
@@ -172,23 +185,37 @@ class Store:
         body = buffer.getvalue()
         write_whole(self._whole, struct.pack("<I", zlib.crc32(body)) + body)
 
-    def read(self) -> tuple[Header | None, list[StoredKeyframe], int]:
-        """Return the header, the keyframes in order and the latest sign of life (clock since boot); sound records only."""
-        header, keyframes, last_ns = None, [], 0
+    def mark(self, kind: bytes, now_ns: int) -> None:
+        """Add a sign of life (BEAT), or that the map was taken up again (TAKEN), at the machine's clock since boot.
+
+        Raises:
+            OSError: the disk refused.
+        """
+        self.append(kind, _CLOCK.pack(now_ns))
+
+    def read(self) -> Log:
+        """Return what the log holds, from its sound records.
+
+        Raises:
+            ValueError: a sound record holds what this version does not write.
+        """
+        log = Log()
         try:
             data = self._log.read_bytes()
         except OSError:
-            return None, [], 0
+            return log
         for kind, body in records(data):
-            if kind == HEADER and header is None:
-                header = _header(body)
+            if kind == HEADER and log.header is None:
+                log.header = _header(body)
             elif kind == KEYFRAME:
-                keyframes.append(decode_keyframe(body))
-                last_ns = max(last_ns, keyframes[-1].age_ns)
-            elif kind == BEAT:
-                last_ns = max(last_ns, struct.unpack("<Q", body)[0])
+                log.keyframes.append(decode_keyframe(body))
+                log.last_ns = max(log.last_ns, log.keyframes[-1].age_ns)
+            elif kind in {BEAT, TAKEN}:
+                (stamp_ns,) = _CLOCK.unpack(body)
+                log.last_ns = max(log.last_ns, stamp_ns)
+                log.taken_ns += [stamp_ns] * (kind == TAKEN)
         self._size = len(data)
-        return header, keyframes, last_ns
+        return log
 
     def read_map(self) -> Arrays:
         """Return the map as a whole; empty when there is none that is sound."""

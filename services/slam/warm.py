@@ -6,6 +6,7 @@ import numpy as np
 
 from schemas.camera import Intrinsics
 from services.slam.config import SlamConfig
+from services.slam.keeper import rejoin, whole_map
 from services.slam.slam import Slam
 
 _done = False
@@ -26,9 +27,17 @@ def warm() -> None:
         shift = 4 * index
         slam.track(index, np.ascontiguousarray(np.roll(grey, shift, axis=1)), depth_m)
     _warm_loop(slam)
+    _warm_keeping(slam)
     slam.polish()
     slam.final_trajectory()
     _done = True
+
+
+def _warm_keeping(slam: Slam) -> None:
+    """Gather the map for the disk, and put none of it together."""
+    whole = whole_map(slam)
+    none = np.zeros(0, np.int32)
+    rejoin(slam.atlas.points, slam.atlas.keyframes, none, whole["n"][:0], none, whole["feature"][:0], slam.atlas.scales)
 
 
 def _warm_loop(slam: Slam) -> None:

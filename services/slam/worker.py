@@ -47,6 +47,11 @@ class Crew(Protocol):
         """Jobs that have not begun."""
         ...
 
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is being done and nothing waits."""
+        ...
+
     def close(self) -> None:
         """Finish the job at hand and stop."""
         ...
@@ -56,6 +61,7 @@ class Inline:
     """Does each job at once on the caller's thread: the same frames give the same map."""
 
     waiting = 0
+    idle = True
 
     def frame(self) -> AbstractContextManager[None]:
         """Return nothing to wait for."""

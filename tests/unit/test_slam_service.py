@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 
 from schemas.camera import Intrinsics, RgbdFrame
@@ -12,6 +17,7 @@ from services.camera.codecs import decode_depth
 from services.common.clock import SimulatedClock
 from services.common.config import TreedockConfig
 from services.common.memory import Hub, MemoryContext
+from services.slam.config import SlamConfig
 from services.slam.service import build
 from tests.unit.slam_room import INTRINSICS, look, turn_on_the_spot
 
@@ -89,3 +95,67 @@ def test_a_frame_from_the_past_is_dropped() -> None:
         hub.run()
     assert sum(isinstance(m, Pose) for m in said) == 1
     assert context.health.counters["dropped_bad_frames"] == 1
+
+
+class RealTime(MemoryContext):
+    """As over Zenoh: nothing waits for what a message causes."""
+
+    lockstep = False
+
+
+def live(folder: Path) -> tuple[Hub, RealTime, list[Wire]]:
+    hub = Hub(TreedockConfig(slam=SlamConfig(map_folder=folder)), SimulatedClock())
+    context = RealTime(hub, "slam")
+    build(context)
+    said: list[Wire] = []
+    for topic in (SLAM_POSE, SLAM_KEYFRAME, SLAM_GRAPH):
+        hub.context("camera").on(topic, said.append)
+    return hub, context, said
+
+
+def test_live_the_pose_waits_for_nothing_and_mapping_is_told_though_no_frame_comes(tmp_path: Path) -> None:
+    hub, context, said = live(tmp_path)
+    for seq in range(0, 12, 3):
+        hub.context("camera").publish(CAMERA_RGBD, frame(seq))
+        hub.run()
+    assert isinstance(said[0], Pose)
+    versions = [m.version for m in said if isinstance(m, Graph)]
+    end_s = time.monotonic() + 20.0
+    while not any(isinstance(m, Graph) and m.reason == "full_ba" for m in said) and time.monotonic() < end_s:
+        hub.advance_to(hub.clock.now_ns() + 500_000_000)
+        hub.run()
+        time.sleep(0.01)
+    told = [m for m in said if isinstance(m, Graph)]
+    assert told[-1].reason == "full_ba"
+    assert [m.version for m in told] == sorted({m.version for m in told})
+    assert len(told) > len(versions)
+    hub.stop()
+    assert context.health.counters["maps_begun"] == 1
+    assert not list(tmp_path.iterdir()), "a slam that was stopped leaves no map"
+
+
+def test_live_a_second_slam_goes_on_in_the_map_of_a_killed_one(tmp_path: Path) -> None:
+    hub, _, said = live(tmp_path)
+    for seq in range(0, 12, 3):
+        hub.context("camera").publish(CAMERA_RGBD, frame(seq))
+        hub.run()
+    first = [m for m in said if isinstance(m, Pose)]
+    assert wait_for(lambda: (tmp_path / "map.npz").exists())
+    again, context, said = live(tmp_path)
+    again.context("camera").publish(CAMERA_RGBD, replace(frame(20), colour=bytes(320 * 240 * 3)))
+    again.context("camera").publish(CAMERA_RGBD, frame(21))
+    again.run()
+    second = [m for m in said if isinstance(m, Pose)]
+    assert [p.status for p in second] == ["relocalising", "tracking"]
+    assert {p.map_id for p in (*first, *second)} == {first[0].map_id}
+    assert second[-1].reset_counter != first[-1].reset_counter
+    assert context.health.counters["maps_taken_up"] == 1
+    graphs = [m for m in said if isinstance(m, Graph)]
+    assert [g.reason for g in graphs][:1] == ["restored"]
+
+
+def wait_for(condition: Callable[[], bool]) -> bool:
+    end_s = time.monotonic() + 20.0
+    while not condition() and time.monotonic() < end_s:
+        time.sleep(0.01)
+    return condition()

@@ -91,9 +91,9 @@ def test_the_log_is_bounded_and_tidied(tmp_path: Path) -> None:
     assert (tmp_path / "keyframes.log").stat().st_size <= 3000
     store.keep_only({2, 3})
     assert not store.full
-    header, kept, _ = store.read()
-    assert header == Header("m", "b", "c")
-    assert [k.serial for k in kept] == [2, 3]
+    log = store.read()
+    assert log.header == Header("m", "b", "c")
+    assert [k.serial for k in log.keyframes] == [2, 3]
 
 
 def test_a_damaged_whole_map_is_no_map(tmp_path: Path) -> None:
@@ -178,6 +178,24 @@ def test_an_old_map_another_boots_or_another_cameras_is_refused(
     monkeypatch.setattr(keeping, "boot_id", lambda: "tomorrow")
     assert "last start" in taken_up(tmp_path)[1]
     assert "no map" in taken_up(tmp_path / "empty")[1]
+
+
+def test_a_map_that_ends_slam_again_and_again_is_left(tmp_path: Path) -> None:
+    kept_map(tmp_path, 3)
+    whys = []
+    for _ in range(4):
+        slam, why_not = taken_up(tmp_path)
+        whys.append(why_not)
+        if not why_not:
+            Keeper(Store(tmp_path, MOST)).resume(slam)
+    assert whys[:3] == [""] * 3
+    assert "3 times" in whys[3]
+
+
+def test_a_whole_map_of_another_version_is_refused_not_fatal(tmp_path: Path) -> None:
+    kept_map(tmp_path, 3)
+    Store(tmp_path, MOST).write_map({"numbers": np.arange(2)})
+    assert "cannot be read" in taken_up(tmp_path)[1]
 
 
 def test_a_disk_that_refuses_is_told_and_slam_goes_on(tmp_path: Path) -> None:
