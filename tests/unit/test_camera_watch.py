@@ -116,6 +116,15 @@ def test_a_depth_scale_that_cannot_be_right_is_told(scale: float, told: bool) ->
     assert not told or f"is depth_scale {scale:g}" in watch.note()
 
 
+def test_a_recording_mostly_out_of_range_is_told_at_the_end_and_not_in_flight() -> None:
+    rng = np.random.default_rng(3)
+    watch = DepthScaleWatch()
+    for _ in range(20):
+        watch.see(rng.uniform(3000, 12_000, (480, 640)).astype(np.uint16), 1000.0)
+    assert watch.note() == ""
+    assert "only 33% of the depth data lie within 0.5 to 6 m (median 7." in watch.total()
+
+
 def test_process_tells_what_was_wrong_with_a_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -20,7 +20,7 @@ class ConditionedSource:
     def __init__(self, source: Source, config: CameraConfig) -> None:
         self._source = source
         self._conditioner = Conditioner(config)
-        self._scale = DepthScaleWatch()
+        self._scale = DepthScaleWatch(config.min_range_m, config.max_range_m)
         self.watch = StreamWatch(stall_s=config.stall_s)
         self.stage_ms: dict[str, list[float]] = defaultdict(list)
         """Durations of each stage, one for each frame; who reads them may empty them."""
@@ -39,7 +39,7 @@ class ConditionedSource:
 
     def total(self) -> str:
         """Return what was wrong over the whole stream, in one line; empty for nothing."""
-        return "; ".join(part for part in (self.watch.total(), self._scale.note(), self._source.remark) if part)
+        return "; ".join(part for part in (self.watch.total(), self._scale.total(), self._source.remark) if part)
 
     def _conditioned(self, frame: RgbdFrame) -> RgbdFrame | BadFrame:
         self.watch.see(frame.stamp_ns, fingerprint(frame))
