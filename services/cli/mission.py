@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 _ASK_AGAIN_S = 1.0
 _SETTLE_S = 20.0
 """After the mission's end, the longest wait for the simulator to say that the aircraft is parked."""
+_LAST_WORD_S = 3.0
 _END = frozenset({"landed", "failed", "released"})
 
 
@@ -133,6 +134,8 @@ class Conductor:
         if self._ended_s is None:
             return False
         parked = self._watch.clock is None or self._watch.clock.phase == "done" or self.state == "failed"
+        if parked and self.state not in _END:  # the simulator saw it first
+            return now_s - self._ended_s > _LAST_WORD_S
         return parked or now_s - self._ended_s > _SETTLE_S
 
     @property

@@ -55,9 +55,16 @@ class Board:
     wanted_id: int | None = None
     docked_count: int = 0
     trees_wanted: int = 1
-    scan_left_rad: float = 0.0
     scan_seen: set[int] = field(default_factory=set)
     scan_turned_rad: float = 0.0
+    scan_sure_yaw_rad: float | None = None
+    """The last heading (unwrapped) at which slam was sure of itself."""
+    scan_slow_until_rad: float = 0.0
+    relocking: bool = False
+    relocks: int = 0
+    relocked_at_rad: float = 0.0
+    homeward: bool = False
+    """No further tree: the way leads to the start."""
     dock_direction: Matrix | None = None
     """Unit vector (2,) from the axis to the docking place."""
     dock_offset_m: float = 0.0

@@ -52,6 +52,9 @@ class DockConfig(BaseModel):
     integral_per_s: float = Field(default=0.25, ge=0.0)
     """How fast a standing offset between setpoint and camera is learnt and taken out; 0 switches it off."""
     integral_limit_m: float = Field(default=0.20, ge=0.0)
+    stiffness: float = Field(default=0.5, ge=0.0, le=1.0)
+    """How much firmer than the autopilot alone the place is held: its own gain is 1. In gusts of 0.6 m/s the true
+    place strays 0.11 m RMS with 0, 0.06 m with 0.5 and 0.05 m with 0.8, where less margin is left."""
     timeout_s: float = Field(default=60.0, gt=0.0)
     hold_s: float = Field(default=4.0, ge=0.0)
     """Hover after docking before what follows."""
@@ -92,6 +95,8 @@ class FailsafeConfig(BaseModel):
     ground_hold_s: float = Field(default=30.0, gt=0.0)
     battery_start_share: float = Field(default=0.40, ge=0.0, le=1.0)
     battery_land_share: float = Field(default=0.20, ge=0.0, le=1.0)
+    battery_next_share: float = Field(default=0.30, ge=0.0, le=1.0)
+    """Below this no further tree is begun: return and land."""
     obstacle_hold_s: float = Field(default=10.0, gt=0.0)
     restart_hold_s: float = Field(default=5.0, gt=0.0)
     operator_hold_s: float = Field(default=180.0, gt=0.0)
@@ -121,6 +126,8 @@ class NavigatorConfig(BaseModel):
     climb_speed_m_s: float = Field(default=0.4, gt=0.0)
     scan_rate_rad_s: float = Field(default=math.radians(25.0), gt=0.0)
     scan_overlap_rad: float = Field(default=math.radians(20.0), ge=0.0)
+    scan_falter_inliers: int = Field(default=40, ge=0)
+    """With fewer matched points than this slam falters: the scan turns back and comes again slowly."""
     scan_turns_max: float = Field(default=2.2, ge=1.0)
     turn_rate_rad_s: float = Field(default=math.radians(25.0), gt=0.0)
     approach_speed_m_s: float = Field(default=0.35, gt=0.0)

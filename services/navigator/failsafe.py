@@ -13,10 +13,8 @@ from typing import Literal
 import numpy as np
 
 from schemas.navigation import MissionStateName
-from services.common.geometry import Matrix
 from services.navigator.board import Board
-from services.navigator.path import clearance_m
-from services.navigator.routing import moving_into, seen_free_m, way_round
+from services.navigator.obstacles import GUARDED, MOVING_M_S, Block, braking_m
 from services.navigator.track import Step
 
 Response = Literal["release", "hold", "land"]
@@ -27,12 +25,6 @@ AIRBORNE: frozenset[MissionStateName] = frozenset(
 """States in which the aircraft may fly under our setpoints."""
 _VISUAL: frozenset[MissionStateName] = frozenset({"approach", "dock"})
 _NEEDS_LIST: frozenset[MissionStateName] = frozenset({"scan", "select", "face"})
-_BODY_MARGIN_M = 0.10
-_MOVING_M_S = 0.05
-_REACTION_S = 0.5
-_GUARDED: frozenset[MissionStateName] = frozenset({"approach", "dock", "undock", "return"})
-_ASK_ROUND_NS, _WAIT_NS = 250_000_000, 1_500_000_000
-"""How often a way round is looked for, and how long what stands in the way is waited for first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,12 +49,7 @@ class Watch:
     armed: bool = False
     """The vehicle was armed in offboard for this mission."""
     ground_seen: bool = False
-    blocked_way: Matrix | None = None
-    """Direction (2,) in map in which the live guard braked, while it is blocked."""
-    blocked_word: str = ""
-    blocked_ns: int = 0
-    asked_ns: int = 0
-    """When a way round was looked for last."""
+    block: Block = field(default_factory=Block)
     _jumped_ns: int | None = None
     _jump_word: str = ""
     _map_id: str | None = field(default=None)
@@ -70,12 +57,7 @@ class Watch:
     def begin(self, mission_id: int) -> None:
         """Forget the last mission."""
         self.mission_id, self.engaged, self.armed = mission_id, False, False
-        self.ground_seen, self._jumped_ns, self._map_id, self.blocked_way = False, None, None, None
-
-    def block(self, way: Matrix, word: str, now_ns: int) -> str:
-        """Remember what was braked for, and return it."""
-        self.blocked_way, self.blocked_word, self.blocked_ns, self.asked_ns = way, word, now_ns, now_ns
-        return word
+        self.ground_seen, self._jumped_ns, self._map_id, self.block = False, None, None, Block()
 
     def check(self, board: Board, state: MissionStateName, resume: MissionStateName) -> Fault | None:
         """Return the most pressing fault, or None. ``resume`` is the state a hold interrupts."""
@@ -228,49 +210,8 @@ def _obstacle(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
     here, velocity = b.here, b.trajectory.velocity_m_s[:2]
     if here is None:
         return None
-    word = _blocked_still(w, b, doing) if w.blocked_way is not None else _blocking(w, b, doing, velocity)
+    word = w.block.still(b, doing) if w.block.way is not None else w.block.by(b, doing, velocity)
     return Fault("obstacle", "hold", word, b.config.failsafe.obstacle_hold_s) if word else None
-
-
-def _blocked_still(w: Watch, b: Board, doing: MissionStateName) -> str:
-    """Return why the way that was braked on cannot be gone on, empty when it can, or when there is one round."""
-    assert w.blocked_way is not None
-    if b.now_ns < w.asked_ns + _ASK_ROUND_NS:
-        return w.blocked_word
-    w.asked_ns = b.now_ns
-    waited = b.now_ns - w.blocked_ns >= _WAIT_NS
-    round_it = way_round(b, doing) if waited else False
-    straight = seen_free_m(b, w.blocked_way) >= b.config.safety_radius_m
-    ahead = w.blocked_way * b.config.approach_speed_m_s
-    if round_it or (round_it is None and straight and moving_into(b, ahead) is None):
-        w.blocked_way = None
-        b.planned_ns = -1
-        return ""
-    return w.blocked_word
-
-
-def _blocking(w: Watch, b: Board, doing: MissionStateName, velocity: Matrix) -> str:
-    """Return what stands or comes in the way within the braking distance, empty when nothing does."""
-    assert b.here is not None
-    speed = float(np.linalg.norm(velocity))
-    braking = speed * _REACTION_S + speed * speed / b.config.motion.max_accel_m_s2
-    mover = moving_into(b, velocity) if doing in _GUARDED else None
-    if mover is not None:
-        word = f"something moves into the way at {float(np.hypot(*mover.state[2:])):.1f} m/s"
-        return w.block(velocity / speed if speed > _MOVING_M_S else _ahead(b), word, b.now_ns)
-    if speed < _MOVING_M_S:
-        return ""
-    if seen_free_m(b, velocity) < b.config.aircraft_radius_m + _BODY_MARGIN_M + braking:
-        return w.block(velocity / speed, "something stands in the way", b.now_ns)
-    here = b.here.position_m[:2]
-    discs = b.discs(b.config.aircraft_radius_m + _BODY_MARGIN_M)
-    now, then = clearance_m(here, discs), clearance_m(here + velocity, discs)
-    return "a trunk stands in the way" if then < 0.0 and then < now else ""
-
-
-def _ahead(b: Board) -> Matrix:
-    assert b.here is not None
-    return np.array([np.cos(b.here.yaw_rad), np.sin(b.here.yaw_rad)])
 
 
 def _unseen(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
@@ -279,9 +220,9 @@ def _unseen(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
     here, velocity = b.here, b.trajectory.velocity_m_s[:2]
     speed = float(np.linalg.norm(velocity))
     space = b.around.space
-    if here is None or speed < 2.0 * _MOVING_M_S or doing not in _GUARDED or not (b.config.live_guard and space.fed):
+    if here is None or speed < 2.0 * MOVING_M_S or doing not in GUARDED or not (b.config.live_guard and space.fed):
         return None
-    braking = speed * _REACTION_S + speed * speed / b.config.motion.max_accel_m_s2
+    braking = braking_m(b, speed)
     start = here.position_m[:2]
     if (
         space.known_ahead_m(start, start + velocity / speed * braking, 0.5 * b.config.aircraft_radius_m)

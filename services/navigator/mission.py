@@ -7,39 +7,31 @@ state can exceed the limits.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from schemas.command import CommandName
 from schemas.navigation import MissionStateName
+from services.navigator.approaching import at_height
 from services.navigator.board import Board
 from services.navigator.config import NavigatorConfig
-from services.navigator.failsafe import AIRBORNE, Fault, Watch
+from services.navigator.failsafe import Fault, Watch
+from services.navigator.orders import Verdict, carry_out
 from services.navigator.preflight import missing
 from services.navigator.states import STATES
 from services.navigator.surroundings import START_COLUMN_M
 from services.navigator.telling import Telling
 from services.navigator.track import Step
-from services.navigator.trajectory import Fence
+from services.navigator.trajectory import Aim, Fence
 from services.navigator.values import Event, Inputs, Intent, Next, Outputs
 
 _RESUME: dict[MissionStateName, MissionStateName] = {"approach": "face", "dock": "approach"}
 """Where a hold resumes when not in the state it interrupted: the target is looked for again."""
-_GROUNDED: frozenset[MissionStateName] = frozenset({"idle", "landed", "failed", "released"})
 _FLOOR_M = 0.3
 """The geofence's floor lies this far below the start: ground may fall away."""
 
 HoldCause = Literal["operator", "fault", "restart"]
-
-
-@dataclass(frozen=True, slots=True)
-class Verdict:
-    """The answer to an order."""
-
-    accepted: bool
-    reason: str
 
 
 class Mission:
@@ -62,37 +54,13 @@ class Mission:
         self._events: list[Event] = []
         self._seq = 0
 
-    # -- orders -------------------------------------------------------------------------------------------------
     def order(self, name: CommandName, tree_id: int | None, now_ns: int) -> Verdict:
         """Carry out an operator's command, or say why not."""
-        if name == "start":
-            return self._start(now_ns)
-        if self.state not in AIRBORNE | {"preflight"}:
-            return _no(f"nothing to {name}: the mission is {self.state}")
-        if name in ("abort", "land"):
-            return self._come_down(name, now_ns)
-        if name == "hold":
-            if self.state == "preflight":
-                return _no("still on the ground: abort instead")
-            self._hold(
-                Fault("", "hold", "the operator said hold", self.config.failsafe.operator_hold_s), "operator", now_ns
-            )
-            return _yes("holding")
-        if name == "resume":
-            return self._order_resume(now_ns)
-        if name == "choose":
-            return self._order_choose(tree_id, now_ns)
-        return self._order_next(now_ns)
+        return carry_out(self, name, tree_id, now_ns)
 
-    def _start(self, now_ns: int) -> Verdict:
+    def begin(self, now_ns: int) -> None:
+        """Begin a new mission with a board of its own; what is known of poses stays."""
         v = self.board.vehicle
-        if self.state not in _GROUNDED:
-            return _no(f"a mission is under way: {self.state}")
-        if not self.config.handheld:
-            if v is None:
-                return _no("no word from the autopilot: is the bridge running and the vehicle connected?")
-            if v.armed:
-                return _no("the vehicle is armed: a mission starts from the ground, disarmed")
         engaged = v.engaged_mission_id if v is not None else 0
         self.mission_id = max(self.mission_id, engaged) + 1
         board, self.board = self.board, Board(self.config)
@@ -100,54 +68,7 @@ class Mission:
         self.board.trees_wanted = self.config.trees_wanted
         self.watch.begin(self.mission_id)
         self._hold_cause = "fault"
-        self._go(Next("preflight", f"mission {self.mission_id} ordered"), now_ns)
-        return _yes(self.reason)
-
-    def _come_down(self, name: str, now_ns: int) -> Verdict:
-        if self.state == "preflight" or (self.state == "take_off" and not self.watch.armed):
-            self._go(Next("landed", f"{name} ordered before take-off"), now_ns)
-        else:
-            self._go(Next("landing", f"{name} ordered"), now_ns)
-        return _yes(self.reason)
-
-    def _order_resume(self, now_ns: int) -> Verdict:
-        if self.state != "hold":
-            return _no(f"nothing to resume: the mission is {self.state}")
-        if self.fault is not None:
-            return _no(f"cannot resume yet: {self.fault.word}")
-        self._leave_hold("the operator said resume", now_ns)
-        return _yes(self.reason)
-
-    def _order_choose(self, tree_id: int | None, now_ns: int) -> Verdict:
-        tree = next((t for t in self.board.trees if t.id == tree_id), None)
-        if tree is None:
-            known = ", ".join(str(t.id) for t in self.board.trees) or "none"
-            return _no(f"no tree {tree_id} in the list (known: {known})")
-        if not tree.suitable:
-            return _no(f"tree {tree_id} is not suitable")
-        if tree.id in self.board.visited_ids:
-            self.board.trees_wanted += 1
-        self.board.wanted_id = tree.id
-        if self.state in ("face", "approach"):
-            self.board.drop_target()
-            self._go(Next("select", f"the operator chose tree {tree_id}"), now_ns)
-        elif self.state in ("dock", "docked"):
-            self.board.trees_wanted = max(self.board.trees_wanted, self.board.docked_count + 1)
-            self._go(Next("undock", f"the operator chose tree {tree_id}"), now_ns)
-        return _yes(f"tree {tree_id} is next")
-
-    def _order_next(self, now_ns: int) -> Verdict:
-        if self.state not in ("face", "approach", "dock", "docked"):
-            return _no(f"no target to leave: the mission is {self.state}")
-        if self.state != "docked":
-            self.board.finish_target(visited=False)
-        self.board.trees_wanted = max(self.board.trees_wanted, self.board.docked_count + 1)
-        if self.state in ("dock", "docked"):
-            self._go(Next("undock", "the operator said next"), now_ns)
-        else:
-            self.board.drop_target()
-            self._go(Next("select", "the operator said next"), now_ns)
-        return _yes("the next tree")
+        self.go(Next("preflight", f"mission {self.mission_id} ordered"), now_ns)
 
     # -- the step -----------------------------------------------------------------------------------------------
     def step(self, inputs: Inputs) -> Outputs:
@@ -190,7 +111,7 @@ class Mission:
             self._resume, self._hold_cause = "select", "restart"
             self._prepare_flight()
             word = "the navigator was restarted in flight: holding, then landing"
-            self._hold(Fault("", "hold", word, self.config.failsafe.restart_hold_s), "restart", now_ns)
+            self.hold(Fault("", "hold", word, self.config.failsafe.restart_hold_s), "restart", now_ns)
 
     def _answer(self, now_ns: int) -> None:
         """Do what the fault in force asks for."""
@@ -201,13 +122,13 @@ class Mission:
             return
         self._clear_since_ns = None
         if fault.response == "release":
-            self._go(Next("released", fault.word), now_ns)
+            self.go(Next("released", fault.word), now_ns)
         elif self.state == "take_off" and not self.watch.armed and not self.config.handheld:
-            self._go(Next("failed", f"before take-off: {fault.word}"), now_ns)
+            self.go(Next("failed", f"before take-off: {fault.word}"), now_ns)
         elif fault.response == "land":
-            self._go(Next("landing", fault.word), now_ns)
+            self.go(Next("landing", fault.word), now_ns)
         elif self.state != "hold":
-            self._hold(fault, "fault", now_ns)
+            self.hold(fault, "fault", now_ns)
         elif self._held_s(now_ns) > min(self._hold_limit_s, fault.hold_s):
             self._give_up_hold(fault.word, now_ns)
 
@@ -216,7 +137,7 @@ class Mission:
             self._clear_since_ns = now_ns
         if self._hold_cause == "fault":
             if (now_ns - self._clear_since_ns) / 1e9 >= self.config.failsafe.clear_s:
-                self._leave_hold("all is well again", now_ns)
+                self.leave_hold("all is well again", now_ns)
         elif self._held_s(now_ns) > self._hold_limit_s:
             self._give_up_hold(self.reason, now_ns)
 
@@ -226,15 +147,17 @@ class Mission:
     def _give_up_hold(self, word: str, now_ns: int) -> None:
         if self.config.handheld:
             return
-        self._go(Next("landing", f"held for {self._held_s(now_ns):.0f} s: {word}"), now_ns)
+        self.go(Next("landing", f"held for {self._held_s(now_ns):.0f} s: {word}"), now_ns)
 
-    def _hold(self, fault: Fault, cause: HoldCause, now_ns: int) -> None:
+    def hold(self, fault: Fault, cause: HoldCause, now_ns: int) -> None:
+        """Go to hold, to come back from it to what is being done now."""
         if self.state != "hold" and cause != "restart":
             self._resume = self.state
         self._hold_cause, self._hold_limit_s, self._clear_since_ns = cause, fault.hold_s, None
-        self._go(Next("hold", fault.word), now_ns)
+        self.go(Next("hold", fault.word), now_ns)
 
-    def _leave_hold(self, reason: str, now_ns: int) -> None:
+    def leave_hold(self, reason: str, now_ns: int) -> None:
+        """Go on with what the hold interrupted, as far as that is still possible."""
         target = _RESUME.get(self._resume, self._resume)
         if target in ("face", "approach", "docked", "undock") and self.board.axis_m is None:
             target = "select"
@@ -244,7 +167,7 @@ class Mission:
             target, reason = ("landing" if done else "scan"), f"{reason}; in a new map"
         if self.board.trajectory.fence is None:
             self._prepare_flight()
-        self._go(Next(target, reason), now_ns)
+        self.go(Next(target, reason), now_ns)
 
     def _intent(self, now_ns: int) -> Intent:
         """Return what the present state wants; follow at most a few transitions in one step."""
@@ -258,22 +181,32 @@ class Mission:
             if self.state == "landing":
                 return self._landing(now_ns)
             if self.state == "hold":
-                blind = self.board.here is None or (self.fault is not None and self.fault.blind)
-                return Intent("stop", "freeze" if blind else "brake")
+                return self._holding()
             result = STATES[self.state](self.board, self._held_s(now_ns))
             if isinstance(result, Intent):
                 return result
-            self._go(result, now_ns)
+            self.go(result, now_ns)
         return Intent("stop")
+
+    def _holding(self) -> Intent:
+        """Stand still; give way to what comes too near."""
+        b, fault = self.board, self.fault
+        if b.here is None or (fault is not None and fault.blind):
+            return Intent("stop", "freeze")
+        place = self.watch.block.retreat(b) if fault is not None and fault.name == "obstacle" else None
+        if place is None:
+            return Intent("stop", "brake")
+        aim = Aim(at_height(b, place), b.trajectory.yaw_rad, 0.3, 0.0)
+        return Intent("backward", "aim", aim, float(np.linalg.norm(place - b.here.position_m[:2])), "m")
 
     def _preflight(self, now_ns: int) -> bool:
         """Return whether the state changed."""
         faults = missing(self.board, self.config)
         if not faults:
             self._prepare_flight()
-            self._go(Next("take_off", "preflight passed"), now_ns)
+            self.go(Next("take_off", "preflight passed"), now_ns)
         elif self._held_s(now_ns) > self.config.preflight_wait_s:
-            self._go(Next("failed", f"preflight: {'; '.join(faults)}"), now_ns)
+            self.go(Next("failed", f"preflight: {'; '.join(faults)}"), now_ns)
         else:
             return False
         return True
@@ -294,7 +227,7 @@ class Mission:
     def _landing(self, now_ns: int) -> Intent:
         v = self.board.vehicle
         if self.config.handheld or (v is not None and not v.armed):
-            self._go(Next("landed", f"down and disarmed after {self.reason}"), now_ns)
+            self.go(Next("landed", f"down and disarmed after {self.reason}"), now_ns)
             return Intent("stop", "follow", engage=False)
         return Intent("landing", "freeze" if self.board.here is None else "brake", land=True)
 
@@ -313,18 +246,11 @@ class Mission:
         if self.state == "scan":
             b.scan_turned_rad += t.yaw_rad - before
 
-    def _go(self, to: Next, now_ns: int) -> None:
+    def go(self, to: Next, now_ns: int) -> None:
+        """Change the state, with an event that says why."""
         if to.state == self.state and to.state != "hold":
             return
         self._events.append(Event(now_ns, self.state, to.state, to.reason))
         if to.state != self.state:
             self.previous, self.since_ns = self.state, now_ns
         self.state, self.reason = to.state, to.reason
-
-
-def _yes(reason: str) -> Verdict:
-    return Verdict(accepted=True, reason=reason)
-
-
-def _no(reason: str) -> Verdict:
-    return Verdict(accepted=False, reason=reason)

@@ -82,6 +82,31 @@ def moving_into(b: Board, velocity_m_s: Matrix) -> Mover | None:
     return conflict(here.position_m[:2], velocity_m_s, moving, b.now_ns, keep)
 
 
+def retreat(b: Board) -> Matrix | None:
+    """Return a place (2,) to give way to, when something came too near; None when nothing did, or there is no room."""
+    here = b.here
+    keep = b.config.aircraft_radius_m + _BODY_MARGIN_M
+    if here is None or not b.config.live_guard:
+        return None
+    start, near = here.position_m[:2], b.around.discs(keep, b.now_ns)
+    if clearance_m(start, near) >= 0.0:
+        return None
+    worst = min(near, key=lambda d: float(np.hypot(start[0] - d.x_m, start[1] - d.y_m)) - d.keep_out_m)
+    away = float(np.arctan2(start[1] - worst.y_m, start[0] - worst.x_m))
+    for turn in _WAYS_RAD:
+        place = start + _RETREAT_M * np.array([np.cos(away + turn), np.sin(away + turn)])
+        better = clearance_m(place, b.discs(keep)) > clearance_m(start, b.discs(keep)) + 0.1
+        known = b.around.space.known_ahead_m(start, place, _NARROW_M) >= _RETREAT_M - 1e-6
+        inside = b.fence_disc is None or clearance_m(place, [b.fence_disc]) <= 0.0
+        if better and known and inside:
+            return np.asarray(place)
+    return None
+
+
+_RETREAT_M, _NARROW_M = 0.5, 0.25
+_WAYS_RAD = (0.0, 0.6, -0.6, 1.2, -1.2)
+
+
 def way_round(b: Board, doing: MissionStateName) -> bool | None:
     """Whether there is a clear way on for what is being done; None where nothing can be planned for it."""
     here = b.here

@@ -30,6 +30,9 @@ Result = Intent | Next
 
 _HEIGHT_TOLERANCE_M = 0.12
 _STILL_M_S = 0.15
+_SLOW_SHARE, _SURE_TIMES, _RELOCKS = 0.4, 1.5, 2
+"""Of the scan's rate; of the inliers below which slam falters; tries at one place."""
+_SLOW_RAD, _NEW_PLACE_RAD = float(np.radians(30.0)), float(np.radians(20.0))
 _CENTRED_RAD = float(np.radians(2.0))
 _GAP_M = 0.025
 """Guidance says stop within this distance of the aim."""
@@ -62,7 +65,10 @@ def take_off(b: Board, since_s: float) -> Result:
 
 
 def scan(b: Board, since_s: float) -> Result:
-    """Entry: at flight height. Exit: turned once with overlap and every heading seen -> select; else a second turn."""
+    """Entry: at flight height. Exit: turned once with overlap and every heading seen -> select; else a second turn.
+
+    Where slam falters (few inliers) it turns back to the last heading at which slam was sure, and comes again slowly.
+    """
     del since_s
     c, here = b.config, b.here
     if here is None:
@@ -71,9 +77,35 @@ def scan(b: Board, since_s: float) -> Result:
     if turned >= whole and (b.scan_gaps == 0 or turned >= c.scan_turns_max * 2.0 * np.pi):
         gaps = f", {b.scan_gaps} of 36 headings unseen" if b.scan_gaps else ""
         return Next("select", f"turned {np.degrees(turned):.0f} deg{gaps}")
+    back = _relock(b)
+    if back is not None:
+        return back
     left = max(whole - turned, 0.1)
-    aim = Aim(_cruise(b), b.trajectory.yaw_rad + left + 0.2, 0.2, c.scan_rate_rad_s)
-    return Intent("turn_left", "aim", aim, left, "rad")
+    slow = b.scan_turned_rad < b.scan_slow_until_rad
+    rate = c.scan_rate_rad_s * (_SLOW_SHARE if slow else 1.0)
+    return Intent("turn_left", "aim", Aim(_cruise(b), b.trajectory.yaw_rad + left + 0.2, 0.2, rate), left, "rad")
+
+
+def _relock(b: Board) -> Intent | None:
+    """Turn back to where slam was sure, when it falters; None while it does not, or where that did not help."""
+    assert b.inputs.pose is not None
+    inliers, c, t = b.inputs.pose.message.inliers, b.config, b.trajectory
+    if inliers >= _SURE_TIMES * c.scan_falter_inliers:
+        b.scan_sure_yaw_rad, b.relocking = t.yaw_rad, False
+        if b.scan_turned_rad > b.relocked_at_rad + _NEW_PLACE_RAD:
+            b.relocks = 0
+    elif inliers < c.scan_falter_inliers and b.scan_sure_yaw_rad is not None and not b.relocking:
+        b.relocked_at_rad = b.scan_turned_rad
+        b.relocking, b.relocks = b.relocks < _RELOCKS, b.relocks + 1
+        b.scan_slow_until_rad = b.scan_turned_rad + _SLOW_RAD
+    if not b.relocking or b.scan_sure_yaw_rad is None:
+        return None
+    turn = b.scan_sure_yaw_rad - t.yaw_rad
+    if abs(turn) < np.radians(1.0):
+        b.relocking = False
+        return None
+    aim = Aim(_cruise(b), b.scan_sure_yaw_rad, 0.2, c.scan_rate_rad_s * _SLOW_SHARE)
+    return Intent("turn_left" if turn > 0.0 else "turn_right", "aim", aim, abs(turn), "rad")
 
 
 def select(b: Board, since_s: float) -> Result:
@@ -143,6 +175,9 @@ def docked(b: Board, since_s: float) -> Result:
     """Entry: docked. Exit: after dock.hold_s, more trees wanted -> undock; else return or landing."""
     seen = b.to_axis()
     if since_s >= b.config.dock.hold_s:
+        share = None if b.vehicle is None else b.vehicle.battery_share
+        if b.docked_count < b.trees_wanted and share is not None and share < b.config.failsafe.battery_next_share:
+            return _go_home(b, f"battery at {100.0 * share:.0f} %: no further tree")
         if b.docked_count < b.trees_wanted:
             return Next("undock", f"{b.docked_count} of {b.trees_wanted} trees done")
         return _go_home(b, f"{b.docked_count} of {b.trees_wanted} trees done")
@@ -161,7 +196,7 @@ def undock(b: Board, since_s: float) -> Result:
     left = c.undock_m - float(np.linalg.norm(here.position_m[:2] - b.axis_m))
     if left < 0.1 or since_s > 20.0:
         b.drop_target()
-        if b.docked_count >= b.trees_wanted:
+        if b.docked_count >= b.trees_wanted or b.homeward:
             return _go_home(b, "clear of the trunk")
         return Next("select", "clear of the trunk")
     goal = at_height(b, b.axis_m + b.dock_direction * c.undock_m)
@@ -201,6 +236,7 @@ def _go_home(b: Board, reason: str) -> Next:
     if b.config.handheld:
         return Next("landed", reason)
     if b.config.return_home or b.trees_wanted > 1:
+        b.homeward = True
         if b.axis_m is not None and b.dock_direction is not None:
             return Next("undock", f"{reason}: away from the trunk first")
         return Next("return", reason)

@@ -49,6 +49,7 @@ class World:
     vehicle_silent: bool = False
     slam: SlamStatus | None = "tracking"
     map_id: str = "m1"
+    inliers: int = 200
     reset_counter: int = 0
     shift_m: Matrix = field(default_factory=lambda: np.zeros(3))
     shift_yaw_rad: float = 0.0
@@ -151,7 +152,7 @@ class World:
             stamp_ns=self.now_ns, seq=self._steps, map_id=self.map_id, status=status,
             T_map_camera=to_transform(T) if status == "tracking" else None, covariance=None,
             reset_counter=self.reset_counter, graph_version=0, keyframe_id=None, T_keyframe_camera=None,
-            inliers=200, up_sigma_rad=0.01, processing_ms=10.0,
+            inliers=self.inliers, up_sigma_rad=0.01, processing_ms=10.0,
         )  # fmt: skip
 
     def _list(self, version: int) -> TreeList:

@@ -247,13 +247,15 @@ def test_a_person_who_crosses_is_waited_for() -> None:
     assert world.least_m > 0.6
 
 
-def test_an_obstacle_without_a_way_round_ends_in_a_landing() -> None:
-    world = _approaching()
-    here = world.position_m[:2].copy()
-    angles = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
-    world.walkers = [here + 1.1 * np.array([np.cos(a), np.sin(a)]) for a in angles]
-    assert world.run("landing", 120.0) == "landing"
-    assert world.least_m > 0.45
+def test_a_tree_without_a_free_place_before_it_is_given_up() -> None:
+    """Bushes all round it, which no map knows: seen on the way, gone round in vain, left alone."""
+    world = World(trees=[tree(1, 4.0, 1.0)])
+    angles = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
+    world.walkers = [np.array([4.0, 1.0]) + 1.4 * np.array([np.cos(a), np.sin(a)]) for a in angles]
+    world.start()
+    assert world.run("landing", 240.0) == "landing"
+    assert not any(event.after == "docked" for event in world.events)
+    assert world.least_m > 0.6
 
 
 def test_a_tree_that_cannot_be_reached_in_time_is_given_up() -> None:
@@ -288,3 +290,20 @@ def test_without_eyes_preflight_refuses() -> None:
     board = Board(NavigatorConfig())
     assert any("depth images" in word for word in missing(board, board.config))
     assert not any("depth" in word for word in missing(board, NavigatorConfig(live_guard=False)))
+
+
+def test_it_gives_way_to_somebody_who_comes_too_near() -> None:
+    world = _approaching()
+    world.walkers = [_ahead(world, 1.6)]
+    world.walker_velocity_m_s = -0.5 * (_ahead(world, 1.0) - world.position_m[:2])
+    begin = world.position_m[:2].copy()
+    world.run("hold", 3.0)
+    for _ in range(40):
+        world.step()
+        if float(np.hypot(*(world.walkers[0] - world.position_m[:2]))) < 0.75:
+            break
+    world.walker_velocity_m_s = np.zeros(2)
+    place = world.position_m[:2].copy()
+    world.run(seconds=1.5)
+    assert np.hypot(*(world.position_m[:2] - world.walkers[0])) > np.hypot(*(place - world.walkers[0])) + 0.1
+    assert np.hypot(*(world.position_m[:2] - begin)) < 1.5

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from services.navigator.config import NavigatorConfig
-from tests.unit.navigator_world import World, tree
+from tests.unit.navigator_world import STEP_S, World, tree
 
 
 def _course(world: World) -> list[str]:
@@ -128,3 +128,62 @@ def test_handheld_guides_a_person_without_a_vehicle() -> None:
             break
     assert world.state == "docked", world.mission.reason
     assert {"turn_left", "toward", "docked"} <= commands
+
+
+def test_slam_that_falters_in_the_scan_is_turned_back_for() -> None:
+    """Few points at one heading: back to where slam was sure, then on again slowly, and in the end all was seen."""
+    world = World()
+    world.start()
+    assert world.run("scan") == "scan"
+    world.run(seconds=4.0)
+    farthest, backward, slow, t = 0.0, 0.0, False, world.mission.board.trajectory
+    for _ in range(round(60.0 / STEP_S)):
+        turned = world.mission.board.scan_turned_rad
+        world.inliers = 30 if 1.9 < turned < 2.2 and world.mission.board.relocks < 2 else 200
+        world.step()
+        farthest = max(farthest, world.mission.board.scan_turned_rad)
+        backward = max(backward, farthest - world.mission.board.scan_turned_rad)
+        slow = slow or (backward > 0.0 and 0.1 < t.yaw_rate_rad_s < 0.5 * world.config.scan_rate_rad_s)
+        if world.state != "scan":
+            break
+    assert backward > np.radians(0.5)
+    assert slow
+    assert world.mission.board.scan_gaps == 0
+    assert world.run("docked") == "docked"
+
+
+def test_slam_that_stays_unsure_does_not_stop_the_scan() -> None:
+    world = World()
+    world.start()
+    world.run("scan")
+    world.run(seconds=2.0)
+    world.inliers = 30
+    assert world.run("select", 60.0) == "select"
+
+
+def test_a_second_turn_when_headings_were_missed() -> None:
+    world = World()
+    world.start()
+    world.run("scan")
+    world.run(seconds=3.0)
+    seen = world.mission.board.scan_seen
+    for _ in range(round(30.0 / STEP_S)):
+        world.step()
+        seen.discard(10)
+        if abs(world.mission.board.scan_turned_rad) > 2.0 * np.pi + np.radians(30.0):
+            break
+    assert world.state == "scan", "one heading is still unseen"
+    assert world.run("select", 60.0) == "select"
+    assert "unseen" not in world.mission.reason
+
+
+def test_a_low_battery_sends_it_home_before_the_next_tree() -> None:
+    world = World(NavigatorConfig(trees_wanted=2))
+    world.start()
+    assert world.run("docked") == "docked"
+    world.battery = 0.25
+    world.run("return", 60.0)
+    assert world.state == "return", world.mission.reason
+    assert world.run("landed", 120.0) == "landed"
+    assert np.hypot(*world.position_m[:2]) < 0.5
+    assert world.mission.board.docked_count == 1
