@@ -117,6 +117,8 @@ class LiveMaps:
 
     def end(self) -> None:
         """Stop in order: the map is over."""
+        if self._keeper is not None:
+            self._keeper.let_go()
         self.crew.close()
         if self._keeper is not None:
             self._keeper.end()

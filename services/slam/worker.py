@@ -23,6 +23,7 @@ Job = Callable[[], None]
 
 _SWITCH_S = 0.0005
 """How long a thread may keep Python to itself: the default of 5 ms would be added to a frame's time."""
+_CLOSE_S = 0.3
 _NICE = 5
 """Where cores are few tracking runs first (Linux: per thread)."""
 
@@ -53,7 +54,7 @@ class Crew(Protocol):
         ...
 
     def close(self) -> None:
-        """Finish the job at hand and stop."""
+        """Stop: what waits is forgotten."""
         ...
 
 
@@ -150,11 +151,11 @@ class Beside:
         self._jobs.put(job)
 
     def close(self) -> None:
-        """Finish the job at hand, forget the rest and stop."""
+        """Forget what waits and stop; a job that takes long is not waited for: its thread ends with the process."""
         while not self._jobs.empty():
             self._jobs.get()
         self._jobs.put(None)
-        self._thread.join(2.0)
+        self._thread.join(_CLOSE_S)
 
     def _run(self) -> None:
         if hasattr(os, "setpriority"):
