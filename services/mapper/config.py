@@ -31,6 +31,10 @@ class MapperConfig(BaseModel):
     """Points of different keyframes that one voxel of the whole map takes up: bounds the map by its surface."""
     nearer: float = Field(default=0.7, gt=0.0, le=1.0)
     """A full voxel still takes a point that was seen from less than this share of the range of those in it."""
+    enough_looks: int = Field(default=12, ge=1)
+    """Keyframes from about the same place that looked the same way: of further ones only what is new gets in."""
+    shell_sigmas: float = Field(default=2.0, ge=0.0)
+    """New is then what lies further along its ray from a taken voxel than so many deviations of the range."""
     max_points: int = Field(default=3_000_000, gt=0)
     """Memory bound of the whole map (about 60 bytes a point); beyond it the oldest submaps are thinned."""
     rekey_m: float = Field(default=0.02, gt=0.0)

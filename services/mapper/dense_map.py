@@ -18,6 +18,8 @@ Matrix = NDArray[np.float64]
 
 _ARM_M = 3.0
 """Distance at which a submap's turn is felt as a shift."""
+_ALIKE_M, _ALIKE_COSINE = 1.0, 0.9
+"""Two cameras so near and so little turned (25 degrees) look at the same."""
 _SMALL_LOSS = 0.05
 """A moved submap that would lose a smaller share of its points keeps them: not worth sending it again."""
 _NO_KEYS = np.zeros(0, dtype=np.int64)
@@ -78,6 +80,8 @@ class DenseMap:
         self.submaps: dict[int, MapSubmap] = {}
         self.ground = GroundGrid(config.ground_cell_m)
         self._voxels = VoxelTable(config)
+        self._cameras: dict[tuple[int, int], list[int]] = {}
+        """Keyframes by the cell of the map that they were made in."""
 
     @property
     def nbytes(self) -> int:
@@ -91,6 +95,7 @@ class DenseMap:
         self.submaps, self.size, self.map_id = {}, 0, map_id
         self.ground = GroundGrid(self._config.ground_cell_m)
         self._voxels = VoxelTable(self._config)
+        self._cameras = {}
         return gone
 
     def add(
@@ -104,7 +109,10 @@ class DenseMap:
         own = np.eye(4) if T_camera_cloud is None else T_camera_cloud
         T = T_map_camera @ own
         self.ground.take(cloud.points_m, T)
-        keep, keys = self._voxels.admit(cloud.points_m, T, self.ground.lows_m)
+        c = self._config
+        shell = c.shell_sigmas * c.range_noise_per_m if self._often_seen(T) else 0.0
+        keep, keys = self._voxels.admit(cloud.points_m, T, self.ground.lows_m, shell)
+        self._cameras.setdefault(_cell(T), []).append(keyframe_id)
         submap = MapSubmap(
             keyframe_id, stamp_ns, cloud.points_m[keep], cloud.rgb[keep], T, anchor_id=keyframe_id,
             T_anchor_submap=own, keys=keys[keep], T_keyed=T,
@@ -120,6 +128,7 @@ class DenseMap:
             keep, keys = self._voxels.admit(submap.points_m, submap.T_map_submap, self.ground.lows_m)
             self._voxels.take(keys[~keep])
             submap.keys, submap.T_keyed = keys, submap.T_map_submap
+            self._cameras.setdefault(_cell(submap.T_map_submap), []).append(submap.submap_id)
             self.submaps[submap.submap_id] = submap
             self.size += len(submap.points_m)
 
@@ -152,6 +161,17 @@ class DenseMap:
             points.append((s.points_m @ T[:3, :3].T + T[:3, 3]).astype(np.float32))
             rgb.append(s.rgb)
         return MapCloud(np.concatenate(points), np.concatenate(rgb))
+
+    def _often_seen(self, T_map_camera: Matrix) -> bool:
+        """Return whether enough keyframes looked this way from here: more would only fill the noise around the surfaces."""
+        a, b = _cell(T_map_camera)
+        looks = 0
+        for cell in ((a + i, b + j) for i in (-1, 0, 1) for j in (-1, 0, 1)):
+            for k in self._cameras.get(cell, ()):
+                looks += _alike(T_map_camera, self.submaps[k].T_map_submap)
+                if looks >= self._config.enough_looks:
+                    return True
+        return False
 
     def _rekey(self, submaps: list[MapSubmap]) -> list[MapSubmap]:
         """Let far moved submaps take the voxels of their new place; return those that lost points to others there."""
@@ -205,6 +225,14 @@ class DenseMap:
             self._keep_only(submap, keep)
             changed.append(submap)
         return changed
+
+
+def _cell(T: Matrix) -> tuple[int, int]:
+    return int(np.floor(T[0, 3] / _ALIKE_M)), int(np.floor(T[1, 3] / _ALIKE_M))
+
+
+def _alike(a: Matrix, b: Matrix) -> bool:
+    return float(a[:3, 2] @ b[:3, 2]) > _ALIKE_COSINE and float(np.abs(a[:3, 3] - b[:3, 3]).max()) < _ALIKE_M
 
 
 def _shift_m(a: Matrix, b: Matrix) -> float:

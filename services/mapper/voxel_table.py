@@ -22,7 +22,9 @@ _START_SLOTS = 1 << 16
 @njit(cache=True, nogil=True)
 def _slot(key: np.int64, table_keys: Keys) -> int:
     mask = table_keys.shape[0] - 1
-    h = key * np.int64(-7046029254386353131)  # Fibonacci hashing (Knuth, TAOCP 3, 6.4): the upper bits are the mixed ones
+    h = key * np.int64(
+        -7046029254386353131
+    )  # Fibonacci hashing (Knuth, TAOCP 3, 6.4): the upper bits are the mixed ones
     at = (h ^ (h >> 32)) & mask
     while table_keys[at] != -1 and table_keys[at] != key:
         at = (at + 1) & mask
@@ -30,12 +32,37 @@ def _slot(key: np.int64, table_keys: Keys) -> int:
 
 
 @njit(cache=True, nogil=True)
+def _key(x: float, y: float, z: float, voxel: float, level: np.int64) -> np.int64:
+    key = np.int64(np.floor(x / voxel)) + 1048576
+    key = key * np.int64(2097152) + np.int64(np.floor(y / voxel)) + 1048576
+    return key * np.int64(2097152) + 2 * (np.int64(np.floor(z / voxel)) + 524288) + level
+
+
+@njit(cache=True, nogil=True)
+def _known_along(
+    x: float, y: float, z: float, dx: float, dy: float, dz: float, steps: int, voxel: float, level: np.int64,
+    farthest: float, table_keys: Keys, table_count: NDArray[np.uint8], table_range: NDArray[np.float32],
+) -> bool:  # fmt: skip
+    """Tell whether a voxel within so many steps along the ray holds a point seen from nearer than ``farthest``."""
+    for step in range(1, steps + 1):
+        for f in (-float(step), float(step)):
+            key = _key(x + f * dx, y + f * dy, z + f * dz, voxel, level)
+            at = _slot(key, table_keys)
+            if table_keys[at] == key and table_count[at] > 0 and table_range[at] <= farthest:
+                return True
+    return False
+
+
+@njit(cache=True, nogil=True)
 def _admit(
     points: NDArray[np.float32], T: Matrix, lows: NDArray[np.float32], cell: float, fine_low: float, fine_high: float,
     fine: float, coarse: float, per_voxel: int, nearer: float, table_keys: Keys, table_count: NDArray[np.uint8],
-    table_range: NDArray[np.float32], keep: NDArray[np.bool_], keys: Keys,
+    table_range: NDArray[np.float32], shell: float, keep: NDArray[np.bool_], keys: Keys,
 ) -> int:  # fmt: skip
-    """Enter points; mark those that their voxel takes and name each one's voxel. Return the number of new slots."""
+    """Enter points; mark those that their voxel takes and name each one's voxel. Return the number of new slots.
+
+    With ``shell`` above zero a point is known already when a voxel is taken within ``shell r^2`` along its ray.
+    """
     half = lows.shape[0] // 2
     fresh = 0
     for i in range(points.shape[0]):
@@ -48,12 +75,17 @@ def _admit(
         voxel, level = coarse, np.int64(1)
         if fine_low <= z - lows[a, b] <= fine_high:
             voxel, level = fine, np.int64(0)
-        key = np.int64(np.floor(x / voxel)) + 1048576
-        key = key * np.int64(2097152) + np.int64(np.floor(y / voxel)) + 1048576
-        key = key * np.int64(2097152) + 2 * (np.int64(np.floor(z / voxel)) + 524288) + level
+        key = _key(x, y, z, voxel, level)
         keys[i] = key
         at = _slot(key, table_keys)
         r = np.sqrt(px * px + py * py + pz * pz)
+        if shell > 0.0 and table_count[at] == 0:
+            s = voxel / max(r, 0.1)
+            dx, dy, dz = s * (x - T[0, 3]), s * (y - T[1, 3]), s * (z - T[2, 3])
+            steps = int(shell * r * r / voxel)
+            if _known_along(x, y, z, dx, dy, dz, steps, voxel, level, r / nearer, table_keys, table_count, table_range):
+                keep[i] = False
+                continue
         if table_keys[at] == -1:
             table_keys[at] = key
             fresh += 1
@@ -114,7 +146,7 @@ class VoxelTable:
         return int(self._keys.nbytes + self._counts.nbytes + self._ranges.nbytes)
 
     def admit(
-        self, points_m: NDArray[np.float32], T_map_points: Matrix, lows_m: NDArray[np.float32]
+        self, points_m: NDArray[np.float32], T_map_points: Matrix, lows_m: NDArray[np.float32], shell_per_m: float = 0.0
     ) -> tuple[NDArray[np.bool_], Keys]:
         """Enter points (N, 3); return which of them got in, and the voxel of each.
 
@@ -122,6 +154,7 @@ class VoxelTable:
             points_m: in the frame of their camera.
             T_map_points: takes them to map.
             lows_m: lowest heights per cell of the map (``GroundGrid``).
+            shell_per_m: times the range squared, how far along its ray a point may lie from a taken voxel and be known.
         """
         n = len(points_m)
         self.reserve(n)
@@ -129,7 +162,7 @@ class VoxelTable:
         c = self._config
         self._used += int(_admit(
             points_m, T_map_points, lows_m, c.ground_cell_m, c.fine_low_m, c.fine_high_m, c.voxel_m, c.coarse_voxel_m,
-            c.per_voxel, c.nearer, self._keys, self._counts, self._ranges, keep, keys,
+            c.per_voxel, c.nearer, self._keys, self._counts, self._ranges, shell_per_m, keep, keys,
         ))  # fmt: skip
         return keep, keys
 
