@@ -22,12 +22,18 @@ _ASK_AGAIN_S = 1.0
 _SETTLE_S = 20.0
 """After the mission's end, the longest wait for the simulator to say that the aircraft is parked."""
 _LAST_WORD_S = 3.0
+_STAND_S = 10.0
 _END = frozenset({"landed", "failed", "released"})
 
 
 def flies(tree: TreedockConfig) -> bool:
     """Return whether a run of this configuration flies a mission."""
-    return tree.camera.source == "sim" and tree.simulator.mode != "scan"
+    return tree.camera.source == "sim" and tree.simulator.mode != "scan" and not tree.navigator.handheld
+
+
+def guides(tree: TreedockConfig) -> bool:
+    """Return whether a run has a mission: flown, or shown to the person who carries the camera."""
+    return flies(tree) or tree.navigator.handheld
 
 
 def prepared(tree: TreedockConfig, autopilot: str) -> TreedockConfig:
@@ -43,6 +49,11 @@ def prepared(tree: TreedockConfig, autopilot: str) -> TreedockConfig:
     from services.simulator.px4.config import LinkConfig
 
     builtin = autopilot == "builtin"
+    if tree.navigator.handheld and tree.camera.source == "sim":
+        # the scripted path is the person, who stands still before the tree for as long as docking takes
+        path = tree.simulator.path.model_copy(update={"hold_s": max(tree.simulator.path.hold_s, _STAND_S)})
+        simulator = tree.simulator.model_copy(update={"mode": "scan", "path": path})
+        return tree.model_copy(update={"simulator": simulator, "clock": "sim"})
     if tree.camera.source != "sim":
         if builtin:
             return tree
@@ -100,7 +111,9 @@ class Flown:
 class Conductor:
     """Orders the start when everything is ready, and follows the mission to its end. Called from one loop."""
 
-    def __init__(self, watch: Watch, within_s: float, trees_wanted: int = 1) -> None:
+    def __init__(self, watch: Watch, within_s: float, trees_wanted: int = 1, *, handheld: bool = False) -> None:
+        self._handheld = handheld
+        """Nothing is flown: no vehicle is asked for, and the end of the pictures is the end."""
         self._watch = watch
         self._trees_wanted = trees_wanted
         self._within_s = within_s
@@ -122,6 +135,9 @@ class Conductor:
     def update(self, *, ready: bool) -> bool:
         """Do what is due; ``ready``: all services are. Return whether the mission is over."""
         now_s = time.monotonic()
+        if not self._started and self._sources_end:
+            self.word = self.word or "the pictures ended before the mission could begin"
+            return True
         if not self._started:
             if ready and self._able and now_s - self._asked_s >= _ASK_AGAIN_S:
                 self._asked_s = now_s
@@ -134,7 +150,7 @@ class Conductor:
         if self._ended_s is None:
             return False
         parked = self._watch.clock is None or self._watch.clock.phase == "done" or self.state == "failed"
-        if parked and self.state not in _END:  # the simulator saw it first
+        if parked and self.state not in _END and not self._handheld:  # the simulator saw it first
             return now_s - self._ended_s > _LAST_WORD_S
         return parked or now_s - self._ended_s > _SETTLE_S
 
@@ -146,12 +162,18 @@ class Conductor:
     @property
     def _able(self) -> bool:
         pose, vehicle = self._watch.pose, self.vehicle
-        return pose is not None and pose.status == "tracking" and vehicle is not None and vehicle.connected
+        tracking = pose is not None and pose.status == "tracking"
+        return tracking and (self._handheld or (vehicle is not None and vehicle.connected))
+
+    @property
+    def _sources_end(self) -> bool:
+        """Whether a recording, or the scripted path, is over: then a person stands still."""
+        return self._handheld and self._watch.source_ended
 
     @property
     def _over(self) -> bool:
         stopped = self._watch.clock is not None and self._watch.clock.phase == "done"
-        return self.state in _END or stopped
+        return self.state in _END or stopped or self._sources_end
 
     def _start(self) -> None:
         from services.navigator.client import send_command

@@ -146,11 +146,13 @@ def with_port(tree: TreedockConfig, *, fixed: bool) -> TreedockConfig:
 
 def services_for(tree: TreedockConfig) -> tuple[str, ...]:
     """Return the services of a run, in the order in which they start."""
-    from services.cli.mission import flies
+    from services.cli.mission import flies, guides
 
     chain = ("router", "camera", "slam", "mapper", "detector", "refiner")
     if flies(tree):
         return (*chain, "navigator", "autopilot", "simulator")
+    if guides(tree):
+        chain = (*chain, "navigator")
     return (*chain, "simulator") if tree.camera.source == "sim" else chain
 
 
@@ -266,11 +268,13 @@ class Run:
         return 0 if conductor is None or values["mission"]["docked"] else _EXIT_NOT_REACHED
 
     def _conductor(self, watch: Watch) -> Conductor | None:
-        from services.cli.mission import Conductor, flies
+        from services.cli.mission import Conductor, guides
 
-        if not flies(self._tree):
+        if not guides(self._tree):
             return None
-        return Conductor(watch, self._tree.supervisor.mission_within_s, self._tree.navigator.trees_wanted)
+        navigator = self._tree.navigator
+        within_s = self._tree.supervisor.mission_within_s
+        return Conductor(watch, within_s, navigator.trees_wanted, handheld=navigator.handheld)
 
     def _still_waiting(self, supervisor: Supervisor, stop: StopSignal) -> Callable[[], bool]:
         def given_up() -> bool:

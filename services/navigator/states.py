@@ -30,6 +30,8 @@ Result = Intent | Next
 
 _HEIGHT_TOLERANCE_M = 0.12
 _STILL_M_S = 0.15
+_HANDHELD_GAPS = 2
+"""Of 36 headings: a person turns as a person does."""
 _SLOW_SHARE, _SURE_TIMES, _RELOCKS = 0.4, 1.5, 2
 """Of the scan's rate; of the inliers below which slam falters; tries at one place."""
 _SLOW_RAD, _NEW_PLACE_RAD = float(np.radians(30.0)), float(np.radians(20.0))
@@ -77,7 +79,9 @@ def scan(b: Board, since_s: float) -> Result:
     if turned >= whole and (b.scan_gaps == 0 or turned >= c.scan_turns_max * 2.0 * np.pi):
         gaps = f", {b.scan_gaps} of 36 headings unseen" if b.scan_gaps else ""
         return Next("select", f"turned {np.degrees(turned):.0f} deg{gaps}")
-    back = _relock(b)
+    if c.handheld and b.scan_gaps <= _HANDHELD_GAPS:
+        return Next("select", "looked all round")
+    back = None if c.handheld else _relock(b)
     if back is not None:
         return back
     left = max(whole - turned, 0.1)
