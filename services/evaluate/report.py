@@ -15,11 +15,11 @@ from services.evaluate.report_pictures import cross_section_svg, filter_plots_sv
 from services.evaluate.top_view import top_view_svg
 
 _MAX_PICTURES = 60
-_STYLE = """
+STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 60rem; padding: 0 1rem; color: #1d2a20; }
 h1, h2 { font-weight: 600; } table { border-collapse: collapse; margin: 0.5rem 0 1.5rem; }
 th, td { padding: 0.2rem 0.7rem; text-align: right; border-bottom: 1px solid #d5ddd6; font-variant-numeric: tabular-nums; }
-th:first-child, td:first-child { text-align: left; }
+th:first-child, td:first-child, .left2 th:nth-child(-n+3), .left2 td:nth-child(-n+3), .left5 th, .left5 td { text-align: left; }
 svg { width: 100%; height: auto; background: #f6f8f5; border: 1px solid #d5ddd6; }
 .warn { color: #9a3412; }
 .trunks { display: flex; flex-wrap: wrap; gap: 0.75rem; } .trunks svg { width: 190px; }
@@ -41,17 +41,19 @@ def report_bytes(
     bad = [f'<p class="warn">left out: {html.escape(reason)}</p>' for reason in values["bad_frame_reasons"][:20]]
     body = [
         "<!doctype html>", '<html lang="en"><head><meta charset="utf-8">', f"<title>{html.escape(title)}</title>",
-        f"<style>{_STYLE}</style></head><body>", f"<h1>{html.escape(title)}</h1>", _summary(values), *bad,
-        "<h2>Trees</h2>", _tree_table(trees), "<h2>From above</h2>", top_view_svg(trees, trajectory, points_m),
-        *_trunks(trees, points_m), *_filters(targets), "<h2>Time</h2>", _timings(values["ms"]), "</body></html>",
+        f"<style>{STYLE}</style></head><body>", f"<h1>{html.escape(title)}</h1>", _summary(values), *bad,
+        "<h2>Trees</h2>", tree_table(trees), "<h2>From above</h2>", top_view_svg(trees, trajectory, points_m),
+        *trunks_section(trees, points_m), *filters_section(targets), "<h2>Time</h2>", _timings(values["ms"]), "</body></html>",
     ]  # fmt: skip
     return ("\n".join(body) + "\n").encode()
 
 
-def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+def table(head: Iterable[str], rows: Iterable[Iterable[str]], left: int = 1) -> str:
+    """Return a table; the first ``left`` columns are words and stand at the left."""
     heads = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
     lines = ["<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
-    return "\n".join(["<table>", f"<tr>{heads}</tr>", *lines, "</table>"])
+    words = f' class="left{left}"' if left > 1 else ""
+    return "\n".join([f"<table{words}>", f"<tr>{heads}</tr>", *lines, "</table>"])
 
 
 def _summary(values: Mapping[str, Any]) -> str:
@@ -71,7 +73,8 @@ def _summary(values: Mapping[str, Any]) -> str:
     return "\n".join(['<section class="cards">', *lines, "</section>"])
 
 
-def _tree_table(trees: Sequence[Tree]) -> str:
+def tree_table(trees: Sequence[Tree]) -> str:
+    """Return the trees as a table."""
     if not trees:
         return "<p>No trees were found.</p>"
     head = (
@@ -96,10 +99,11 @@ def _tree_table(trees: Sequence[Tree]) -> str:
             f"{lean_deg:.1f}", f"{np.degrees(row['arc_rad']):.0f}", f"{row['confidence']:.2f}",
             "yes" if row["suitable"] else "no",
         ))  # fmt: skip
-    return _table(head, rows)
+    return table(head, rows)
 
 
-def _trunks(trees: Sequence[Tree], points_m: NDArray[np.float32]) -> list[str]:
+def trunks_section(trees: Sequence[Tree], points_m: NDArray[np.float32]) -> list[str]:
+    """Return a cross-section of every trunk."""
     if not trees:
         return []
     shown = sorted(trees, key=lambda tree: (not tree.suitable, tree.id))[:_MAX_PICTURES]
@@ -109,7 +113,8 @@ def _trunks(trees: Sequence[Tree], points_m: NDArray[np.float32]) -> list[str]:
     return ["<h2>Trunks</h2>", f"<p>{words}{left_out}</p>", '<section class="trunks">', *pictures, "</section>"]
 
 
-def _filters(targets: Sequence[Target]) -> list[str]:
+def filters_section(targets: Sequence[Target]) -> list[str]:
+    """Return the filters' work over time, nothing when no target was tracked."""
     plots = filter_plots_svg(targets)
     return ["<h2>Target</h2>", plots] if plots else []
 
@@ -119,4 +124,4 @@ def _timings(stages: Mapping[str, Mapping[str, float]]) -> str:
         (name, *(f"{stage[key]:.1f}" for key in ("median", "p99", "max")), f"{stage['count']:.0f}")
         for name, stage in stages.items()
     ]
-    return _table(("stage (ms)", "median", "p99", "max", "times"), rows)
+    return table(("stage (ms)", "median", "p99", "max", "times"), rows)

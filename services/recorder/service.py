@@ -15,7 +15,8 @@ from schemas.health import Health
 from schemas.topics import CAMERA_COMPRESSED, CAMERA_RGBD, TOPICS, Delivery, Topic
 from services.common.context import Context
 from services.common.errors import InputError
-from services.common.files import make_folder
+from services.common.files import make_folder, write_whole
+from services.recorder.chronicle import Chronicle
 from services.recorder.config import RecorderConfig
 from services.recorder.drain import Drain, Entry, Limits
 from services.recorder.foxglove import Translator
@@ -65,6 +66,8 @@ class RecorderService:
         self._begun = dt.datetime.now(dt.UTC)
         self.drain = Drain(self._open_file, limits, lambda: _free_bytes(config.folder))
         self._told: dict[str, int] = {}
+        self._chronicle = Chronicle(context.uav)
+        self._reports, self._reported = 0, False
 
     def take(self, topic: Topic, message: Wire) -> None:
         """Queue one message, and what Foxglove shows of it."""
@@ -77,9 +80,12 @@ class RecorderService:
             self.drain.put(
                 Entry(key, getattr(topic.message, "SCHEMA", topic.name), topic.encoding, data, stamp_ns, seq, heavy)
             )
+            ended = self._chronicle.hear(message)
             if self._translator is not None:
                 for name, shown in self._translator.translate(message):
                     self.drain.put(Entry(name, "", "", shown, stamp_ns, 0, heavy))
+        if ended:
+            self._report()
 
     def tell(self) -> None:
         """Bring the drain's counters and its trouble into health."""
@@ -90,8 +96,25 @@ class RecorderService:
         health.note("disk", self.drain.trouble)
 
     def stop(self) -> None:
-        """Complete the file."""
+        """Complete the file; tell of a mission that had not ended."""
+        if self._chronicle.told and not self._reported:
+            self._report()
         self.drain.close()
+
+    def _report(self) -> None:
+        """Write the mission's report.html beside the recording; a disk that refuses costs the report alone."""
+        from services.evaluate.mission_report import mission_report
+
+        self._reports += 1
+        path = self._config.folder / f"{self._context.uav}-{self._begun:%Y%m%dT%H%M%SZ}-report-{self._reports:02d}.html"
+        try:
+            with self._context.health.timed("report"):
+                write_whole(path, mission_report(self._chronicle.story()))
+        except InputError as error:
+            self._context.health.note("report", str(error))
+            return
+        self._reported = True
+        LOG.info("report: %s", path)
 
     def _open_file(self) -> McapFile:
         for _ in range(1000):

@@ -35,7 +35,10 @@ def test_a_run_is_recorded_and_fed_back(system: System, tmp_path: Path) -> None:
     with system.bus() as bus:
         recorder = treedock(system, "record", "--out", str(tmp_path / "rec"))
         waited_for(bus, "recorder")
-        assert bus.listened(CAMERA_COMPRESSED)
+        deadline = time.monotonic() + 5.0
+        while not bus.listened(CAMERA_COMPRESSED):
+            assert time.monotonic() < deadline, "the recorder does not ask for frames"
+            time.sleep(0.05)
         bus.publish(TREES_LIST, tree_list(1))
         for number in range(5):
             bus.publish(CAMERA_COMPRESSED, frame(number))

@@ -1,0 +1,119 @@
+"""A mission's report: written when it ends, once; it tells what happened and why."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, cast
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+
+from schemas.navigation import MissionState
+from schemas.slam import Pose, Transform
+from schemas.topics import MISSION_STATE, SLAM_POSE, TREES_LIST, TREES_TARGET
+from schemas.trees import Target, TreeList
+from services.common.config import TreedockConfig
+from services.common.context import Context
+from services.common.memory import Hub
+from services.evaluate.mission_report import Story, mission_report, thinned
+from services.recorder.chronicle import Chronicle
+from services.recorder.config import RecorderConfig
+from services.recorder.service import build
+from tests.examples import all_messages
+
+SECOND = 10**9
+
+
+def example(kind: type) -> Any:
+    return next(e for e in all_messages().values() if type(e) is kind)
+
+
+def state(name: str, reason: str, seconds: float = 1.0, **more: object) -> MissionState:
+    made: MissionState = example(MissionState).model_copy(
+        update={"state": name, "reason": reason, "stamp_ns": round(seconds * SECOND), "target_tree_id": None, **more}
+    )
+    return made
+
+
+def pose(seconds: float, x_m: float, map_id: str = "m") -> Pose:
+    at = Transform(position_m=(x_m, 0.0, 1.5), quaternion_xyzw=(0.5, -0.5, 0.5, -0.5))
+    made: Pose = example(Pose).model_copy(
+        update={"stamp_ns": round(seconds * SECOND), "T_map_camera": at, "map_id": map_id}
+    )
+    return made
+
+
+MISSION = (
+    state("take_off", "start was commanded", 1.0),
+    state("scan", "1.5 m reached", 6.0),
+    state("approach", "tree 7 is the nearest unvisited suitable one", 20.0, target_tree_id=7, distance_m=3.2),
+    state("docked", "0.95 m for 3 s", 30.0, target_tree_id=7, docked_count=1),
+    state("landed", "on the ground", 40.0, docked_count=1),
+)
+
+
+def recorded(folder: Path, states: tuple[MissionState, ...]) -> list[Path]:
+    hub = Hub(TreedockConfig(recorder=RecorderConfig(folder=folder, reserve_mb=0)))
+    service = build(cast("Context", hub.context("recorder")))
+    other = hub.context("navigator")
+    other.publish(TREES_LIST, example(TreeList))
+    for number, told in enumerate(states):
+        other.publish(SLAM_POSE, pose(told.stamp_ns / SECOND, 0.2 * number))
+        other.publish(TREES_TARGET, example(Target))
+        for _ in range(3):
+            other.publish(MISSION_STATE, told)
+        hub.run()
+    hub.stop()
+    assert service.drain.trouble == ""
+    return sorted(folder.glob("*report*.html"))
+
+
+def test_a_mission_that_ends_has_its_report_beside_the_recording(tmp_path: Path) -> None:
+    (path,) = recorded(tmp_path, MISSION)
+    page = path.read_text()
+    for words in ("0.95 m for 3 s", "tree 7: tree 7 is the nearest", "landed", "1.5 m reached", "<b>1</b>"):
+        assert words in page
+    assert page.count("start was commanded") == 1, "a state that is repeated is one event"
+
+
+def test_two_missions_are_two_reports_and_a_broken_one_is_told_at_the_stop(tmp_path: Path) -> None:
+    second = tuple(s.model_copy(update={"stamp_ns": s.stamp_ns + 100 * SECOND}) for s in MISSION)
+    assert len(recorded(tmp_path / "two", (*MISSION, *second))) == 2
+    (path,) = recorded(tmp_path / "broken", MISSION[:2])
+    assert "1.5 m reached" in path.read_text()
+    assert recorded(tmp_path / "none", (state("idle", "waiting"),)) == []
+
+
+def test_hostile_words_stay_words() -> None:
+    page = mission_report(Story(states=[state("hold", "<script>alert(1)</script>")])).decode()
+    assert "<script>" not in page
+    assert "&lt;script&gt;" in page
+
+
+@pytest.mark.parametrize(
+    "story", [Story(), Story(uav="uav1", states=list(MISSION)), Story(trees=example(TreeList).trees)]
+)
+def test_every_story_gives_a_whole_page(story: Story) -> None:
+    page = mission_report(story).decode()
+    body = page[page.index("<body>") : page.index("</body>") + 7]
+    ET.fromstring(body.replace("&nbsp;", " "))
+
+
+def test_another_map_begins_the_path_anew() -> None:
+    chronicle = Chronicle("uav1")
+    for number in range(5):
+        chronicle.hear(pose(number, 0.1 * number))
+    chronicle.hear(pose(6.0, 9.0, "other"))
+    assert [T[0, 3] for _, T in chronicle.story().trajectory] == [9.0]
+
+
+def test_thinning_keeps_shape_and_ends() -> None:
+    line = [(n, np.eye(4)) for n in range(1000)]
+    for n, T in line:
+        T[0, 3] = 0.001 * n
+    kept = thinned(line)
+    assert kept[0][0] == 0
+    assert kept[-1][0] == 999
+    assert 45 <= len(kept) <= 60
+    assert thinned([]) == []
