@@ -69,7 +69,7 @@ class FusionConfig(BaseModel):
     """A view that would move the tree by more is of another tree, or of another state of the map."""
     max_radius_m: float = Field(default=0.05, gt=0.0)
     """The same for the radius."""
-    common_xy_m: float = Field(default=0.008, ge=0.0)
+    common_xy_m: float = Field(default=0.010, ge=0.0)
     """Error that all views share: drift of the poses, the sensor's fixed pattern."""
     common_radius_m: float = Field(default=0.003, ge=0.0)
     cloud_xy_m: float = Field(default=0.008, gt=0.0)

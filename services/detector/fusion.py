@@ -149,9 +149,12 @@ def _fused(
     cloud_radius_m2 = max(tree.sigma_radius_m, config.cloud_radius_m) ** 2
     share = cloud_radius_m2 / (cloud_radius_m2 + radius_m2)
     radius = tree.radius_m + share * (radius_m - tree.radius_m)
+    sigma_xy = float(np.sqrt(np.linalg.eigvalsh(0.5 * (covariance + covariance.T))[-1]))
+    sigma_radius = float(np.sqrt((1.0 - share) * cloud_radius_m2))
     return tree.model_copy(update={
         "x_m": tree.x_m + float(moved[0]), "y_m": tree.y_m + float(moved[1]), "radius_m": radius,
-        "sigma_xy_m": float(np.sqrt(np.linalg.eigvalsh(0.5 * (covariance + covariance.T))[-1])),
-        "sigma_radius_m": float(np.sqrt((1.0 - share) * cloud_radius_m2)),
+        # the cloud was made with the same poses by the same sensor: what views share, the two share as well
+        "sigma_xy_m": min(tree.sigma_xy_m, max(sigma_xy, config.common_xy_m)),
+        "sigma_radius_m": min(tree.sigma_radius_m, max(sigma_radius, config.common_radius_m)),
         "suitable": tree.suitable and MIN_SUITABLE_RADIUS_M <= radius <= MAX_SUITABLE_RADIUS_M,
     })  # fmt: skip

@@ -68,8 +68,14 @@ def test_frames_of_one_view_count_once_and_views_add_up_to_the_floor() -> None:
     one, many = (_fed(range(1), n).corrected(TREE, KEYFRAMES).sigma_xy_m for n in (3, 300))
     assert many == pytest.approx(one)
     six = _fed(range(6), 5).corrected(TREE, KEYFRAMES).sigma_xy_m
-    floor = (CONFIG.common_xy_m**-2 + TREE.sigma_xy_m**-2) ** -0.5
-    assert floor < six < one
+    assert CONFIG.common_xy_m <= six < one
+
+
+def test_what_all_views_share_is_the_floor() -> None:
+    sure = TREE.model_copy(update={"sigma_xy_m": 0.010, "sigma_radius_m": 0.001})
+    after = _fed(range(6), 50).corrected(sure, KEYFRAMES)
+    assert after.sigma_xy_m == pytest.approx(CONFIG.common_xy_m)
+    assert after.sigma_radius_m == 0.001, "never less sure than the cloud was"
 
 
 def test_few_frames_say_nothing() -> None:

@@ -138,7 +138,7 @@ class RefinerService:
         state = self._tracker.step(
             frame.stamp_ns, depth, frame.intrinsics, T, covariance_of(pose), note, colour_of(frame)
         )
-        self._health.note("depth against colour", self._tracker.camera_fault)
+        self._health.note("camera", self._tracker.camera_fault)
         return state
 
 

@@ -13,12 +13,19 @@ from schemas.camera import Intrinsics
 from services.detector.refine.agreement import Colour, ColourAgreement
 from services.detector.refine.choose import image_place, in_view, nearest_in_view
 from services.detector.refine.config import RefinerConfig
+from services.detector.refine.consistency import MapConsistency
 from services.detector.refine.correction import Correction
 from services.detector.refine.kalman import TargetFilter
 from services.detector.refine.model import Depth, ExpectedTree, Matrix, Measurement
 from services.detector.refine.refine import refine
 from services.detector.refine.state import TargetState
-from services.detector.refine.view import bearing_of_column, place_in_map, pose_offset_covariance, project_point
+from services.detector.refine.view import (
+    axis_point,
+    bearing_of_column,
+    place_in_map,
+    pose_offset_covariance,
+    project_point,
+)
 
 _MAX_DT_S = 1.0
 _STALE_POSE_COVARIANCE = np.diag([0.1, 0.1, 0.05, 0.03, 0.03, 0.06]) ** 2
@@ -47,11 +54,12 @@ class RefinerTracker:
         self._pose: tuple[int, Matrix] | None = None
         self._recent: deque[tuple[int, Matrix]] = deque(maxlen=8)
         self._agreement = ColourAgreement(config.agreement)
+        self._consistency = MapConsistency(config.consistency)
 
     @property
     def camera_fault(self) -> str:
-        """Return what is wrong between depth and colour, empty when nothing is known to be."""
-        return self._agreement.fault
+        """Return what is wrong with the camera or what is told of it, empty when nothing is known to be."""
+        return self._agreement.fault or self._consistency.fault
 
     @property
     def innovations2(self) -> tuple[float, float, float] | None:
@@ -95,6 +103,7 @@ class RefinerTracker:
         self._place_map_m = None
         self._corrections = {}
         self._recent.clear()
+        self._consistency.interrupt()
 
     def choose(self, tree_id: int | None) -> None:
         """Follow this tree; None: the nearest suitable one in view."""
@@ -136,9 +145,8 @@ class RefinerTracker:
         measured = None
         if depth_m is not None:
             measured = self._measure(depth_m, intrinsics, T, covariance, target)
-        if measured is not None and colour is not None:
-            speed = self._image_speed(target, stamp_ns, intrinsics) if known_pose else None
-            refusal = self._agreement.see(stamp_ns, colour, measured.edges_px, speed)
+        if measured is not None:
+            refusal = self._doubt(measured, target, T if known_pose else None, stamp_ns, intrinsics, colour)
             if refusal:
                 measured, reason = None, refusal
         believed = measured is not None and self._take(measured, T, intrinsics, stamp_ns, known_pose)
@@ -174,6 +182,20 @@ class RefinerTracker:
             self._filter, self._place_map_m = None, None
             return None
         return tree
+
+    def _doubt(
+        self, measured: Measurement, target: ExpectedTree, T: Matrix | None, stamp_ns: int, intrinsics: Intrinsics,
+        colour: Colour | None,
+    ) -> str:  # fmt: skip
+        """Return why the camera is not to be believed in this frame, or nothing."""
+        refusal = ""
+        if colour is not None:
+            speed = self._image_speed(target, stamp_ns, intrinsics) if T is not None else None
+            refusal = self._agreement.see(stamp_ns, colour, measured.edges_px, speed)
+        if T is not None and not refusal:
+            listed = axis_point(self._trees[measured.tree_id], float(T[2, 3]))
+            self._consistency.see(stamp_ns, measured.tree_id, listed, T[:2, 3], measured.bearing_rad, measured.range_m)
+        return refusal or self._consistency.fault
 
     def _image_speed(self, tree: ExpectedTree, stamp_ns: int, intrinsics: Intrinsics) -> float | None:
         """Return how fast the camera's motion lately moved the tree in the image, px/s; None when that is not known.
