@@ -77,6 +77,9 @@ class FailsafeConfig(BaseModel):
     pose_land_s: float = Field(default=0.9, gt=0.0)
     """Without a pose for this long we land. PX4 gives up its position 1 s after the last vision (EKF2_NOAID_TOUT) and
     0.2 s of its own delay; until then it still lands on our word, and lands better: on its position as long as it can."""
+    pose_carried_s: float = Field(default=0.3, ge=0.0)
+    """So much longer when slam fell silent without a word: as long as the bridge carries its last pose on
+    (autopilot.propagate_s)."""
     pose_hold_s: float = Field(default=3.0, gt=0.0)
     """After a jump: in hold until the poses agree with each other again, or landing."""
     pose_jump_m: float = Field(default=0.4, gt=0.0)

@@ -130,7 +130,9 @@ def _slam(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
     f = b.config.failsafe
     del w, doing
     age, blind_s = b.inputs.age_s(b.inputs.pose), b.blind_s
-    response: Response = "land" if blind_s > f.pose_land_s and not b.config.handheld else "hold"
+    # a silent slam's last pose is carried on by the bridge for a while, a lost one's is not
+    limit_s = f.pose_land_s + (0.0 if b.track.lost else f.pose_carried_s)
+    response: Response = "land" if blind_s > limit_s and not b.config.handheld else "hold"
     if age > f.pose_silent_s:
         name, word = _who_is_silent(b)
         return Fault(name, response, f"{word}: no pose for {age:.1f} s", f.pose_hold_s, blind=True)

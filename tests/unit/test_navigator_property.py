@@ -152,6 +152,25 @@ class Flights(RuleBasedStateMachine):
             self.world.target_error_m = outward_m * out + aside_m * np.array([-out[1], out[0]])
         self._step(0.2)
 
+    @rule(
+        ahead_m=st.floats(0.4, 3.0), aside_m=st.floats(-1.5, 1.5), speed=st.sampled_from([0.0, 0.8]), stay=st.booleans()
+    )
+    def somebody(self, ahead_m: float, aside_m: float, speed: float, stay: bool) -> None:
+        """Somebody stands or walks before the camera, or everybody is gone again."""
+        world = self.world
+        yaw = world.yaw_rad
+        ahead, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+        place = world.position_m[:2] + ahead_m * ahead + aside_m * left
+        world.walkers = [place] if stay else []
+        world.walker_velocity_m_s = -speed * np.sign(aside_m or 1.0) * left
+        self._step(1.0)
+        world.walker_velocity_m_s = np.zeros(2)
+
+    @rule(inliers=st.sampled_from([200, 30]))
+    def slam_falters(self, inliers: int) -> None:
+        self.world.inliers = inliers
+        self._step(0.5)
+
     @rule(service=st.sampled_from(["camera", "slam", "mapper", "detector", "refiner"]), dead=st.booleans())
     def service(self, service: str, dead: bool) -> None:
         (self.world.dead.add if dead else self.world.dead.discard)(service)
