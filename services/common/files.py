@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from pathlib import Path
 
 from services.common.errors import InputError
@@ -26,11 +27,17 @@ def write_whole(path: Path, body: bytes, mode: int = 0o644) -> None:
     Raises:
         InputError: the disk refused; ``path`` is then as it was.
     """
+    write_parts(path, (body,), mode)
+
+
+def write_parts(path: Path, parts: Iterable[bytes], mode: int = 0o644) -> None:
+    """Do as ``write_whole`` with a content too large to be held at once."""
     fresh = path.with_name(f".{path.name}.new")
     try:
         fresh.unlink(missing_ok=True)
         with os.fdopen(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as out:
-            out.write(body)
+            for part in parts:
+                out.write(part)
             out.flush()
             os.fsync(out.fileno())
         fresh.replace(path)

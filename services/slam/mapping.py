@@ -18,6 +18,7 @@ from services.slam.features import Features
 from services.slam.links import create_points, points_of, remove_keyframe, shared_counts
 from services.slam.refine import gate
 from services.slam.tidy import cull_recent, describe_all, drop_outliers, fuse, redundancy
+from services.slam.tracking import moved
 from services.slam.worker import Crew
 
 F64 = NDArray[np.float64]
@@ -26,8 +27,10 @@ I32 = NDArray[np.int32]
 _COMPILED_KEYFRAMES = 24
 """Above this the cameras' system is large enough to pay for LAPACK."""
 _REDUNDANT = 0.9
-_BEHIND, _REDUNDANT_BEHIND = 60, 0.6
+_BEHIND, _REDUNDANT_BEHIND = 100, 0.6
 """A keyframe goes whose points three others see to such a share; and to this, once so many younger ones live."""
+_CLOSE_M, _CLOSE_RAD, _REDUNDANT_CLOSE = 0.6, 0.25, 0.3
+"""And to this, when those before and after it stand so close together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,13 +237,14 @@ class Mapping:
         """Look once at each keyframe when it has fallen far behind: there a thinner map will do."""
         with self.step():
             slots = self.atlas.slots
-            if len(slots) <= _BEHIND:
+            if len(slots) <= _BEHIND + 1:
                 return
-            old = int(slots[-_BEHIND])
-            if (
-                self.atlas.keyframes.serial[old]
-                and redundancy(self.atlas.points, self.atlas.keyframes, old) > _REDUNDANT_BEHIND
-            ):
+            before, old, after = (int(s) for s in slots[-_BEHIND - 1 : -_BEHIND + 2])
+            kf = self.atlas.keyframes
+            distance_m, angle_rad = moved(kf.R[before], kf.t[before], kf.R[after], kf.t[after])
+            close = distance_m < _CLOSE_M and angle_rad < _CLOSE_RAD
+            enough = _REDUNDANT_CLOSE if close else _REDUNDANT_BEHIND
+            if kf.serial[old] and redundancy(self.atlas.points, kf, old) > enough:
                 self.retire(old)
 
     def retire(self, k: int) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import mmap
 import os
 import struct
 import zlib
@@ -20,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from services.common.files import make_folder, write_whole
+from services.common.files import make_folder, write_parts, write_whole
 
 F64 = NDArray[np.float64]
 Arrays = dict[str, NDArray]
@@ -90,7 +91,7 @@ def record(kind: bytes, body: bytes) -> bytes:
     return _HEAD.pack(_MAGIC, kind, b"\0", len(body), zlib.crc32(kind + body)) + body
 
 
-def records(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+def records(data: bytes | mmap.mmap) -> Iterator[tuple[bytes, bytes]]:
     """Yield kind and body of each sound record."""
     at = data.find(_MAGIC)
     while 0 <= at <= len(data) - _HEAD.size:
@@ -164,15 +165,16 @@ class Store:
         """Write the log anew with only the keyframes ``serials``.
 
         Raises:
-            InputError: the disk refused; the log is as it was.
+            InputError, OSError: the disk refused; the log is as it was.
         """
-        parts = []
-        for kind, body in records(self._log.read_bytes()):
-            if kind == HEADER or (kind == KEYFRAME and _NUMBERS.unpack_from(body)[0] in serials):
-                parts.append(record(kind, body))
-        data = b"".join(parts)
-        write_whole(self._log, data)
-        self._size = len(data)
+        with self._log.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            kept = (
+                record(kind, body)
+                for kind, body in records(data)
+                if kind == HEADER or (kind == KEYFRAME and _NUMBERS.unpack_from(body)[0] in serials)
+            )
+            write_parts(self._log, kept)
+        self._size = self._log.stat().st_size
 
     def write_map(self, arrays: Arrays) -> None:
         """Replace the map as a whole.
