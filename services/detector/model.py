@@ -55,19 +55,13 @@ class Ground:
         yc = self.y0_m + (j + 0.5) * self.cell_m
         return float(a + b * (x_m - xc) + c * (y_m - yc))
 
-
-@dataclass(frozen=True, slots=True)
-class Slice:
-    """A circle in one horizontal layer of the upright frame."""
-
-    layer: int
-    x_m: float
-    y_m: float
-    z_m: float
-    radius_m: float
-    noise_m: float
-    points: int
-    arc_rad: float
+    def heights_m(self, xy_m: Floats) -> Floats:
+        """Return the ground's z at places (N, 2) of the upright frame."""
+        nx, ny, _ = self.planes.shape
+        low = np.array([self.x0_m, self.y0_m])
+        cell = np.clip(((xy_m - low) // self.cell_m).astype(np.int64), 0, [nx - 1, ny - 1])
+        plane = self.planes[cell[:, 0], cell[:, 1]]
+        return np.asarray(plane[:, 0] + (plane[:, 1:] * (xy_m - low - (cell + 0.5) * self.cell_m)).sum(axis=1))
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,22 +28,32 @@ class Vertical:
 
     up: Up
     how: str
+    score: float = 0.0
+    """How much like trees on ground the cloud looks that way; 0: not at all."""
+    median_radius_m: float = 0.0
+    """Of the trunks that show that way."""
 
 
 def find_vertical(points_m: NDArray[np.float64], config: DetectorConfig | None = None) -> Vertical:
     """Return the direction in which the cloud looks most like trees on ground; z when none does."""
     sample = np.ascontiguousarray(points_m[:: max(1, len(points_m) // _SAMPLE)])
-    scores = []
-    for up, name in _AXES:
-        score = _score(detect_trees(sample, up, None, config))
-        scores.append((score / (1.0 if up[2] == 1.0 else _BETTER), up, name))
-    best, up, name = max(scores, key=lambda s: s[0])
-    if best > 0.0:
-        return Vertical(up, f"{name}: most trunks stand that way")
+    looks = [(detect_trees(sample, up, None, config), up, name) for up, name in _AXES]
+    scores = [_score(result) / (1.0 if up[2] == 1.0 else _BETTER) for result, up, _ in looks]
+    best = int(np.argmax(scores))
+    result, up, name = looks[best]
+    if scores[best] > 0.0:
+        swapped = "" if up[2] == 1.0 else "the axes are swapped, "
+        return _found(result, up, f"{swapped}{name}: most trunks stand that way")
     normal = ground_normal(sample)
-    if normal is not None and _score(detect_trees(sample, normal, None, config)) > 0.0:
-        return Vertical(normal, "the normal of the largest plane, on which trunks stand")
+    if normal is not None:
+        result = detect_trees(sample, normal, None, config)
+        if _score(result) > 0.0:
+            return _found(result, normal, "the normal of the largest plane, on which trunks stand")
     return Vertical((0.0, 0.0, 1.0), "z up is assumed: no direction shows a trunk")
+
+
+def _found(result: DetectionResult, up: Up, how: str) -> Vertical:
+    return Vertical(up, how, _score(result), float(np.median([t.radius_m for t in result.trunks])))
 
 
 def _score(result: DetectionResult) -> float:

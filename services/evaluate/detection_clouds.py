@@ -43,6 +43,7 @@ _FUSION = (
     "services.mapper.config",
     "services.mapper.dense_map",
     "services.mapper.ground_grid",
+    "services.mapper.voxel_table",
 )
 
 

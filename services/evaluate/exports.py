@@ -9,6 +9,7 @@ import csv
 import io
 import json
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -39,22 +40,44 @@ def trajectory_bytes(poses: Iterable[Stamped]) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def ply_bytes(points_m: NDArray[np.float32], rgb: NDArray[np.uint8]) -> bytes:
-    """Return a binary PLY of points (N, 3) with colours (N, 3) RGB, or (0, 3) for none."""
+@dataclass(frozen=True, slots=True)
+class Viewpoints:
+    """From where each point of a cloud was seen: row of ``poses`` (K, 4, 4), T_map_camera, for each point (N,)."""
+
+    index: NDArray[np.uint16]
+    poses: Matrix
+
+
+def ply_bytes(points_m: NDArray[np.float32], rgb: NDArray[np.uint8], seen: Viewpoints | None = None) -> bytes:
+    """Return a binary PLY of points (N, 3) with colours (N, 3) RGB, or (0, 3) for none.
+
+    With viewpoints each vertex names its own by number, and an element ``viewpoint`` holds position and orientation
+    (quaternion x y z w) of the cameras: programs that do not know it pass over it, and ``treedock detect`` has the rays.
+    """
     coloured = len(rgb) == len(points_m) and len(points_m) > 0
     fields: list[tuple[str, str]] = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
     if coloured:
         fields += [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+    if seen is not None:
+        fields.append(("viewpoint", "<u2"))
     table = np.zeros(len(points_m), dtype=fields)
     for column, name in enumerate("xyz"):
         table[name] = points_m[:, column]
     if coloured:
         for column, name in enumerate(("red", "green", "blue")):
             table[name] = rgb[:, column]
-    names = {"<f4": "float", "u1": "uchar"}
+    names = {"<f4": "float", "u1": "uchar", "<u2": "ushort"}
     header = ["ply", "format binary_little_endian 1.0", "comment treedock: map frame, metres, z up"]
     header += [f"element vertex {len(points_m)}", *(f"property {names[kind]} {name}" for name, kind in fields)]
-    return ("\n".join([*header, "end_header"]) + "\n").encode() + table.tobytes()
+    tail = b""
+    if seen is not None:
+        table["viewpoint"] = seen.index
+        header.append(f"element viewpoint {len(seen.poses)}")
+        header += [f"property float {name}" for name in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+        tail = b"".join(
+            np.array([*T[:3, 3], *quaternion_from_rotation(T[:3, :3])], dtype="<f4").tobytes() for T in seen.poses
+        )
+    return ("\n".join([*header, "end_header"]) + "\n").encode() + table.tobytes() + tail
 
 
 def tree_rows(trees: Sequence[Tree]) -> list[dict[str, Any]]:

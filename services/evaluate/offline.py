@@ -28,7 +28,7 @@ from services.common.context import Context
 from services.common.errors import InputError
 from services.common.geometry import from_transform
 from services.common.memory import Hub, MemoryContext
-from services.evaluate.exports import Stamped
+from services.evaluate.exports import Stamped, Viewpoints
 
 SETTLE_S = 3.0
 """Time that passes after the last frame: timers of the services fire, the last corrections reach the map."""
@@ -72,6 +72,8 @@ class OfflineResult:
     """Importing the services and loading (on a machine's first run: compiling) their kernels."""
     duration_s: float
     """Of all, with the set-up."""
+    seen: Viewpoints | None = None
+    """From where each of ``points_m`` was seen."""
 
 
 def default_builders() -> dict[str, Builder]:
@@ -137,6 +139,7 @@ class Chain:
             counters=self._counters(),
             setup_s=self._setup_s,
             duration_s=time.perf_counter() - self._begin_s,
+            seen=None if mapper is None else _viewpoints(mapper.map.submaps.values()),
         )
 
     def _on_pose(self, pose: Pose) -> None:
@@ -159,6 +162,15 @@ class Chain:
             for name, context in self._contexts.items()
             for counter, value in sorted(context.health.counters.items())
         }
+
+
+def _viewpoints(submaps: Iterable[Any]) -> Viewpoints | None:
+    """Return the keyframes that the map's points were seen from; None where the map holds none, or too many to number."""
+    held = list(submaps)
+    if not held or len(held) > np.iinfo(np.uint16).max:
+        return None
+    index = np.repeat(np.arange(len(held), dtype=np.uint16), [len(s.points_m) for s in held])
+    return Viewpoints(index, np.stack([s.T_map_submap for s in held]))
 
 
 def run_offline(

@@ -69,7 +69,7 @@ def result_files(title: str, result: OfflineResult, values: dict[str, Any]) -> d
     return {
         "trajectory.txt": exports.trajectory_bytes(result.trajectory),
         "trajectory_online.txt": exports.trajectory_bytes(result.online),
-        "cloud.ply": exports.ply_bytes(result.points_m, result.rgb),
+        "cloud.ply": exports.ply_bytes(result.points_m, result.rgb, result.seen),
         "trees.json": exports.trees_json(result.trees, "map"),
         "trees.csv": exports.trees_csv(result.trees),
         "trees.geojson": exports.trees_geojson(result.trees, "map"),

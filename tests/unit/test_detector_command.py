@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from services.cli.app import invoke
-from tests.unit.detector_clouds import Floats, ground, trunk
+from services.common.geometry import level_camera
+from services.evaluate.exports import Viewpoints, ply_bytes
+from tests.unit.detector_clouds import Floats, facing, ground, trunk, with_depth_noise
 
 
 @pytest.fixture
@@ -124,3 +126,57 @@ def test_bad_input_is_one_line_and_exit_2(
     assert said.err.count("\n") == 1
     assert said.out == ""
     assert sorted(p.name for p in tmp_path.iterdir()) == before, "something half-written was left"
+
+
+def test_other_units_are_noticed_and_named(forest: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for unit, scale in (("millimetres", 1000.0), ("centimetres", 100.0)):
+        path = _save(tmp_path / f"{unit}.xyz", np.loadtxt(forest) * scale)
+        assert invoke(["detect", str(path), "--json"]) == 0
+        said = capsys.readouterr()
+        told = json.loads(said.out)
+        assert sorted(round(t["radius_m"], 1) for t in told["trees"]) == [0.1, 0.3]
+        assert f"look like {unit}, not metres" in told["note"]
+        assert f"look like {unit}" in said.err
+    feet = _save(tmp_path / "feet.xyz", np.loadtxt(forest) / 0.3048)
+    assert invoke(["detect", str(feet), "--units", "ft", "--json"]) == 0
+    assert sorted(round(t["radius_m"], 1) for t in json.loads(capsys.readouterr().out)["trees"]) == [0.1, 0.3]
+    assert invoke(["detect", str(feet), "--units", "yards"]) == 2
+
+
+def test_pictures_and_trees_of_their_own(forest: Path, tmp_path: Path) -> None:
+    import laspy
+
+    drawn, trees = tmp_path / "drawn", tmp_path / "trees"
+    arguments = ["detect", str(forest), "--up", "0,0,1", "--pictures", str(drawn), "--export-trees", str(trees)]
+    assert invoke(arguments) == 0
+    assert {"kept-001.png", "kept-002.png"} <= {p.name for p in drawn.iterdir()}
+    assert sorted(p.name for p in trees.iterdir()) == ["tree-001.laz", "tree-002.laz"]
+    las = laspy.read(trees / "tree-002.laz")
+    tree = np.asarray(las.classification) == 5
+    assert np.count_nonzero(tree) > 300
+    xyz = np.asarray(las.xyz)
+    assert np.hypot(xyz[tree, 0] - 1.5, xyz[tree, 1]).max() < 0.25
+    assert np.abs(xyz[~tree, 2]).max() < 0.25
+    assert np.hypot(xyz[~tree, 0] - 1.5, xyz[~tree, 1]).max() == pytest.approx(1.5, abs=0.1)
+
+
+def test_why_there_are_none_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(1)
+    scene = np.concatenate([ground(3.0), trunk(1.5, 0.0, 0.1, rng, height=0.7)])
+    assert invoke(["detect", str(_save(tmp_path / "stump.xyz", scene)), "--up", "0,0,1"]) == 0
+    said = capsys.readouterr().err
+    assert "no candidates" in said or "dropped:" in said
+
+
+def test_our_own_cloud_brings_its_views(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rng = np.random.default_rng(2)
+    eye = level_camera([0.0, 0.0, 1.5], 0.0)
+    parts = [trunk(x, y, r, rng, arc=facing(x, y), density=6000.0) for x, y, r in ((3.0, 0.0, 0.1), (4.0, 1.5, 0.15))]
+    cloud = with_depth_noise(np.concatenate([ground(5.0), *parts]), eye[:3, 3], rng)
+    seen = Viewpoints(np.zeros(len(cloud), dtype=np.uint16), eye[None])
+    (tmp_path / "cloud.ply").write_bytes(ply_bytes(cloud.astype(np.float32), np.zeros((0, 3), np.uint8), seen))
+    assert invoke(["detect", str(tmp_path / "cloud.ply"), "--json"]) == 0
+    said = capsys.readouterr()
+    assert "as treedock wrote it" in said.err
+    radii = sorted(t["radius_m"] for t in json.loads(said.out)["trees"])
+    assert radii == pytest.approx([0.1, 0.15], abs=0.008)

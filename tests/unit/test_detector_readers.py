@@ -9,7 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from services.common.errors import InputError
-from services.detector.readers import lzf_decompress, read_cloud
+from services.common.geometry import level_camera
+from services.detector.readers import read_cloud
+from services.detector.readers_pcd import lzf_decompress
+from services.evaluate.exports import Viewpoints, ply_bytes
 
 POINTS = np.round(np.random.default_rng(1).normal(0.0, 3.0, (200, 3)), 3).astype(np.float32)
 
@@ -144,3 +147,18 @@ def test_lzf_back_references() -> None:
 def test_lzf_survives_anything(data: bytes, size: int) -> None:
     out = lzf_decompress(data, size)
     assert out is None or len(out) == size
+
+
+def test_our_own_ply_tells_from_where_it_was_seen(tmp_path: Path) -> None:
+    poses = np.stack([level_camera([0.0, 0.0, 1.5], 0.0), level_camera([1.0, -2.0, 1.5], 2.0)])
+    index = np.arange(len(POINTS)) % 2
+    data = ply_bytes(POINTS.astype(np.float32), np.zeros((0, 3), np.uint8), Viewpoints(index.astype(np.uint16), poses))
+    (tmp_path / "own.ply").write_bytes(data)
+    views = read_cloud(tmp_path / "own.ply").views
+    assert views is not None
+    assert views.rotations is not None
+    assert views.index.tolist() == index.tolist()
+    assert views.origins_m == pytest.approx(poses[:, :3, 3], abs=1e-6)
+    assert views.rotations == pytest.approx(poses[:, :3, :3], abs=1e-6)
+    (tmp_path / "odd.ply").write_bytes(data.replace(b"element viewpoint 2", b"element viewpoint 1"))
+    assert read_cloud(tmp_path / "odd.ply").views is None
