@@ -22,8 +22,8 @@ _BAD_STATES = frozenset({"failed", "released"})
 _GOOD_STATES = frozenset({"docked", "landed"})
 _BATTERY_WARN = 0.30
 
-TrailPoint = tuple[float, float, float]
-"""x and y in map, metres, and the heading, radians."""
+TrailPoint = tuple[float, float, float, float]
+"""x and y in map, metres, the heading, radians, and the height, metres."""
 
 
 @dataclass(slots=True)
@@ -65,13 +65,13 @@ class Aircraft:
         self._extend_trail(self.placed)
 
     def _extend_trail(self, place: tuple[float, float, float, float]) -> None:
-        x, y, _, yaw = place
+        x, y, z, yaw = place
         if self.trail:
             last = self.trail[-1]
             turned = abs(math.remainder(yaw - last[2], 2.0 * math.pi))
             if math.hypot(x - last[0], y - last[1]) < _TRAIL_STEP_M and turned < _TRAIL_STEP_RAD:
                 return
-        self.trail.append((x, y, yaw))
+        self.trail.append((x, y, yaw, z))
 
     def on_mission(self, mission: MissionState) -> None:
         """Take the mission's state and tell of changes."""

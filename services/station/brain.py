@@ -75,6 +75,8 @@ class Brain:
         self.fleet: dict[str, Aircraft] = {}
         self.sessions: dict[int, Session] = {}
         self.refused = 0
+        self.on_cloud_wish: Callable[[str], None] = lambda _: None
+        """Told when a page begins to look at an aircraft's cloud."""
         self._pages = pages
         self._send_order = send_order
         self._state = 0
@@ -166,13 +168,28 @@ class Brain:
             return
         session.last_id = request.id
         if isinstance(request, Cloud):
-            session.cloud_of = request.uav if request.on else ""
+            self._wish_cloud(page, session, request)
         elif request.uav not in self.fleet:
             self._answer(page, request.id, "", session.operator, f"no aircraft {request.uav} is known", accepted=False)
         elif isinstance(request, Order):
             self._order(page, session.operator, request, now_s)
         else:
             self._change_command(page, session.operator, request)
+
+    def _wish_cloud(self, page: int, session: Session, request: Cloud) -> None:
+        if not self.config.cloud:
+            self._reply(
+                page, request.id, accepted=False, reason="the cloud is not served: start the station with --cloud"
+            )
+            return
+        session.cloud_of = request.uav if request.on and request.uav in self.fleet else ""
+        self._reply(page, request.id, accepted=True, reason="")
+        if session.cloud_of:
+            self.on_cloud_wish(session.cloud_of)
+
+    def cloud_watchers(self, uav: str) -> list[int]:
+        """Return the pages that look at an aircraft's cloud."""
+        return [page for page, session in self.sessions.items() if session.cloud_of == uav]
 
     def refuse(self, page: int, why: str) -> None:
         """Log what a page sent and should not have."""

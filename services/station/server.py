@@ -47,6 +47,7 @@ class WebServer:
     def __init__(self, site: Site, config: StationConfig, bound: socket.socket) -> None:
         self._site = site
         self._socket = bound
+        logging.getLogger("uvicorn").setLevel(logging.WARNING)  # each page that opens would be three lines
         try:
             self._server = uvicorn.Server(_uvicorn_config(site, config))
             self._server.config.load()

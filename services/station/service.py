@@ -23,7 +23,20 @@ import zenoh
 from schemas.command import CommandReply
 from schemas.envelope import Message
 from schemas.health import Health
-from schemas.topics import HEALTH, MISSION_STATE, PREFIX, SLAM_POSE, TREES_LIST, TREES_TARGET, VEHICLE_STATE, Topic
+from schemas.mapping import Submap
+from schemas.preview import PreviewImage
+from schemas.topics import (
+    HEALTH,
+    MAP_CLOUD,
+    MISSION_STATE,
+    PREFIX,
+    PREVIEW_IMAGE,
+    SLAM_POSE,
+    TREES_LIST,
+    TREES_TARGET,
+    VEHICLE_STATE,
+    Topic,
+)
 from schemas.trees import TreeList
 from services.common.bus import Bus
 from services.common.health import HealthReporter
@@ -35,20 +48,21 @@ from services.inventory.values import AuditLine
 from services.navigator.client import send_command
 from services.station.aircraft import Aircraft
 from services.station.brain import Brain, Outgoing
+from services.station.cloud import CloudView
 from services.station.events import Event
 from services.station.guard import Guard
 from services.station.launch import open_browser
-from services.station.preview import frame_of, jpeg_fault
+from services.station.preview import frame_of
 from services.station.requests import Request
 from services.station.server import WebServer, bound_socket
 from services.station.web import Download, Site
 
 LOG = logging.getLogger(__name__)
 
-PREVIEW_KEY = "preview/image"
 _REQUEST_RING = 512
 _TOKEN_RING = 1_024
 _ORDERS_AT_ONCE = 8
+_CLOUD_ASKS, _CLOUD_TIMEOUT_S = 12, 5.0
 _TOPICS: dict[Topic, Callable[[Aircraft, Any], object]] = {
     SLAM_POSE: Aircraft.on_pose, MISSION_STATE: Aircraft.on_mission, VEHICLE_STATE: Aircraft.on_vehicle,
     TREES_TARGET: Aircraft.on_target, HEALTH: Aircraft.on_health,
@@ -70,6 +84,8 @@ class Station:
         token = self._token()
         self.site = Site(self.config, Guard(token, local=self.config.local), _Ears(self), self._downloads())
         self.brain = Brain(self.config, self.site, self._send_order, time.time_ns)
+        self.brain.on_cloud_wish = self._on_cloud_wish
+        self._clouds: dict[str, CloudView] = {}
         self._server = WebServer(self.site, self.config, self._bound())
         self.address = self._address(token)
 
@@ -185,7 +201,7 @@ class Station:
         for topic, take in _TOPICS.items():
             bus.subscribe_keys(topic, functools.partial(self._on_message, aircraft, topic, take))
         bus.subscribe(TREES_LIST, functools.partial(self._on_trees, aircraft))
-        self._subscribe_preview(bus, uav)
+        bus.subscribe(PREVIEW_IMAGE, functools.partial(self._on_preview, aircraft))
         return bus
 
     def _on_message(
@@ -221,20 +237,41 @@ class Station:
             visited = mission.visited_tree_ids if mission is not None and same else ()
             self.keeper.offer(aircraft.uav, trees, frozenset(visited))
 
-    def _subscribe_preview(self, bus: Bus, uav: str) -> None:
-        """Pass JPEGs on to the pages as they come; they are checked, never decoded here."""
-        box = self._context.inbox.mailbox(lambda sample: self._on_preview(uav, sample), 1)
-        direct: zenoh.handlers.Callback[zenoh.Sample]
-        direct = zenoh.handlers.Callback(lambda sample: self._context.inbox.put(box, sample), indirect=False)
-        self._kept.append(bus.session.declare_subscriber(f"{PREFIX}/{uav}/{PREVIEW_KEY}", direct))
+    def _on_preview(self, aircraft: Aircraft, message: PreviewImage) -> None:
+        aircraft.links.note(PREVIEW_IMAGE, PREVIEW_IMAGE.name, time.monotonic(), None)
+        self._context.health.count("messages")
+        self.site.latest(f"preview/{aircraft.uav}", frame_of(aircraft.uav, message.jpeg))
 
-    def _on_preview(self, uav: str, sample: zenoh.Sample) -> None:
-        jpeg = sample.payload.to_bytes()
-        if fault := jpeg_fault(jpeg):
-            self._context.health.count("decode_errors.preview/image")
-            LOG.debug("refused a preview of %s: %s", uav, fault)
-            return
-        self.site.latest(f"preview/{uav}", frame_of(uav, jpeg))
+    # -- the cloud, where it reaches here and while somebody looks
+
+    def _on_cloud_wish(self, uav: str) -> None:
+        """Ask for the whole map; follow its changes from then on."""
+        bus = self._buses[uav]
+        if uav not in self._clouds:
+            self._clouds[uav] = CloudView(uav)
+            bus.subscribe(MAP_CLOUD, functools.partial(self._on_submap, uav))
+
+        def ask() -> None:
+            held: set[int] = set()
+            for _ in range(
+                _CLOUD_ASKS
+            ):  # big answers are dropped where the network is full: asked for until none is new
+                found = bus.ask(MAP_CLOUD, None, Submap, _CLOUD_TIMEOUT_S)
+                fresh = [submap for submap in found if submap.submap_id not in held]
+                for submap in fresh:
+                    self.call(functools.partial(self._on_submap, uav, submap))
+                if not fresh:
+                    return
+                held |= {submap.submap_id for submap in fresh}
+
+        self._pool.submit(ask)
+
+    def _on_submap(self, uav: str, submap: Submap) -> None:
+        pages = self.brain.cloud_watchers(uav)
+        if pages:
+            for key, frame in self._clouds[uav].take(submap):
+                for page in pages:
+                    self.site.one(page, frame, key)
 
     # -- orders
 

@@ -133,11 +133,8 @@ def _tree(t: Tree) -> list[Any]:
 
 def trail_view(a: Aircraft) -> dict[str, Any]:
     """Return an aircraft's trail for a page that was just opened."""
-    return {
-        "uav": a.uav,
-        "map": a.trail_map,
-        "points": [[round(x, 2), round(y, 2), round(w, 2)] for x, y, w in a.trail],
-    }
+    points = [[round(value, 2) for value in point] for point in a.trail]
+    return {"uav": a.uav, "map": a.trail_map, "points": points}
 
 
 def operators_view(desk: OperatorDesk) -> list[dict[str, Any]]:

@@ -165,7 +165,7 @@ class Site:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-            with contextlib.suppress(RuntimeError, OSError):  # closed already
+            with contextlib.suppress(RuntimeError, OSError, WebSocketDisconnect):  # closed already
                 await socket.close(_TRY_LATER)
 
     async def _send(self, socket: WebSocket, box: Outbox, ready: asyncio.Event) -> None:

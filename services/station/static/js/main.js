@@ -62,6 +62,7 @@ class Page {
   onWelcome(message) {
     this.me = message.you;
     this.cloud = message.cloud;
+    this.view3d?.reconnected();
     text($("operator"), this.me.name);
     this.events = [];
     this.crafts.forEach((craft) => (craft.treesVersion = -1));

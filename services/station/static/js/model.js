@@ -30,7 +30,7 @@ export class Craft {
     const at = view.pose?.at;
     if (!at) return;
     if (view.pose.map !== this.map) this.restart(view.pose.map);
-    this.extend([at[0], at[1], at[3]]);
+    this.extend([at[0], at[1], at[3], at[2]]);
   }
 
   restart(map) {

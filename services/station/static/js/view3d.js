@@ -1,2 +1,267 @@
-// Placeholder until the 3D view comes.
-export class View3d { constructor() { this.on = false; } set(on) { this.on = on; } show() {} changed() {} draw() {} theme() {} take() {} fit() {} }
+// The view in three dimensions: trunks as cylinders of true radius, aircraft, trail, and the point cloud where it reaches here.
+// Drawn only when something changed. Axes are the map's: x ahead, y left, z up, metres.
+
+import {
+  AmbientLight, BufferAttribute, BufferGeometry, Color, ConeGeometry, CylinderGeometry, DirectionalLight, DynamicDrawUsage, GridHelper, Group, InstancedMesh,
+  Line, LineBasicMaterial, Matrix4, Mesh, MeshLambertMaterial, OrbitControls, PerspectiveCamera, Points, PointsMaterial, Raycaster, Scene, TorusGeometry, Vector2,
+  Vector3, WebGLRenderer,
+} from "../vendor/three.js";
+import { palette } from "./map.js";
+
+const TRUNK_M = 3, TRUNKS_MAX = 2000, TRAIL_MAX = 4000, POINTS_MAX = 400000;
+const SLOW_MS = 70, FAST_MS = 40, REST_MS = 350;
+
+export class View3d {
+  constructor(box, page) {
+    this.box = box;
+    this.page = page;
+    this.on = false;
+    this.budget = this.smooth = POINTS_MAX - 1;
+    this.renderer = new WebGLRenderer({ antialias: true });
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio || 1, 1.5));
+    box.append(this.renderer.domElement);
+    this.scene = new Scene();
+    this.camera = new PerspectiveCamera(55, 1, 0.1, 300);
+    this.camera.up.set(0, 0, 1);
+    this.controls = new OrbitControls(this.camera, this.renderer.domElement);
+    this.controls.maxPolarAngle = Math.PI * 0.495;
+    this.controls.addEventListener("change", () => (this.dirty = true));
+    const sun = new DirectionalLight(0xffffff, 2.2);
+    sun.position.set(-4, -6, 12);
+    this.scene.add(new AmbientLight(0xffffff, 1.6), sun);
+    this.makeTrunks();
+    this.makeCraft();
+    this.makeCloud();
+    this.theme(palette());
+    new ResizeObserver(() => this.resize()).observe(box);
+    this.listen();
+    this.show(page.craft);
+  }
+
+  makeTrunks() {
+    const trunk = new CylinderGeometry(1, 1, 1, 20);
+    trunk.rotateX(Math.PI / 2);
+    trunk.translate(0, 0, 0.5);
+    this.trunks = new InstancedMesh(trunk, new MeshLambertMaterial(), TRUNKS_MAX);
+    this.trunks.frustumCulled = false;
+    this.ring = new Mesh(new TorusGeometry(1, 0.06, 10, 48), new MeshLambertMaterial());
+    this.scene.add(this.trunks, this.ring);
+  }
+
+  makeCraft() {
+    const body = new ConeGeometry(0.22, 0.7, 4);
+    body.rotateZ(-Math.PI / 2); // the tip looks along x
+    body.scale(1, 1, 0.4);
+    this.craftMaterial = new MeshLambertMaterial();
+    this.body = new Group();
+    this.body.add(new Mesh(body, this.craftMaterial));
+    this.trail = new Line(new BufferGeometry(), new LineBasicMaterial());
+    this.trail.geometry.setAttribute("position", new BufferAttribute(new Float32Array(TRAIL_MAX * 3), 3).setUsage(DynamicDrawUsage));
+    this.trail.frustumCulled = false;
+    this.scene.add(this.body, this.trail);
+  }
+
+  makeCloud() {
+    const geometry = new BufferGeometry();
+    geometry.setAttribute("position", new BufferAttribute(new Float32Array(POINTS_MAX * 3), 3).setUsage(DynamicDrawUsage));
+    geometry.setAttribute("color", new BufferAttribute(new Uint8Array(POINTS_MAX * 3), 3, true).setUsage(DynamicDrawUsage));
+    geometry.setDrawRange(0, 0);
+    this.cloud = new Points(geometry, new PointsMaterial({ size: 2, sizeAttenuation: false, vertexColors: true }));
+    this.cloud.frustumCulled = false;
+    this.submaps = new Map();
+    this.scene.add(this.cloud);
+  }
+
+  theme(colours) {
+    this.colours = colours;
+    this.scene.background = new Color(colours.map);
+    if (this.grid) this.scene.remove(this.grid);
+    this.grid = new GridHelper(60, 60, colours.grid5, colours.grid);
+    this.grid.rotation.x = Math.PI / 2;
+    this.scene.add(this.grid);
+    this.craftMaterial.color.set(colours.craft);
+    this.trail.material.color.set(colours.craft);
+    this.ring.material.color.set(colours.target);
+    this.changed();
+  }
+
+  set(on) {
+    this.on = on;
+    this.askCloud();
+    if (on) {
+      this.fit();
+      requestAnimationFrame(() => this.resize());
+    }
+  }
+
+  show(craft) {
+    this.craft = craft;
+    this.clearCloud();
+    this.askCloud();
+    this.fit();
+  }
+
+  /** The station sends the cloud only while somebody looks at it. */
+  askCloud() {
+    if (!this.page.cloud || !this.craft) return;
+    const wanted = this.on ? this.craft.uav : null;
+    if (wanted === this.asked) return;
+    if (this.asked) this.page.link.ask({ t: "cloud", uav: this.asked, on: false });
+    this.asked = wanted;
+    if (wanted) this.page.link.ask({ t: "cloud", uav: wanted, on: true });
+  }
+
+  /** After a reconnect the station knows nothing of our wish. */
+  reconnected() {
+    this.asked = null;
+    this.askCloud();
+  }
+
+  clearCloud() {
+    this.submaps.clear();
+    this.packCloud();
+  }
+
+  /** Take a submap: number, whether it is withdrawn, its count, points (float32), colours (bytes). */
+  take(uav, data, at) {
+    if (!this.craft || uav !== this.craft.uav) return;
+    const head = new DataView(data, at), number = head.getUint32(0, true), removed = head.getUint32(4, true), count = head.getUint32(8, true);
+    const from = at + 12;
+    if (removed || !count) this.submaps.delete(number);
+    else this.submaps.set(number, { points: new Float32Array(data.slice(from, from + count * 12)), colours: new Uint8Array(data, from + count * 12, count * 3) });
+    this.cloudDirty = this.dirty = true;
+  }
+
+  packCloud() {
+    const { position, color } = this.cloud.geometry.attributes;
+    const n = Math.min(POINTS_MAX, [...this.submaps.values()].reduce((sum, s) => sum + s.points.length / 3, 0));
+    const step = stepFor(n); // spread over the whole: the first so many are an even sample, drawn alone while it moves
+    let i = 0;
+    for (const { points, colours } of this.submaps.values()) {
+      for (let k = 0; k < points.length && i < n; k += 3, i++) {
+        const at = ((i * step) % n) * 3;
+        position.array[at] = points[k];
+        position.array[at + 1] = points[k + 1];
+        position.array[at + 2] = points[k + 2];
+        color.array[at] = colours[k];
+        color.array[at + 1] = colours[k + 1];
+        color.array[at + 2] = colours[k + 2];
+      }
+    }
+    position.needsUpdate = color.needsUpdate = true;
+    this.points = n;
+    this.cloudDirty = false;
+    this.dirty = true;
+  }
+
+  changed() {
+    this.treesDirty = this.dirty = true;
+  }
+
+  placeTrunks() {
+    const trees = (this.craft?.trees ?? []).slice(0, TRUNKS_MAX), m = new Matrix4(), k = this.colours, colour = new Color();
+    this.ring.visible = false;
+    trees.forEach((tree, i) => {
+      const kind = this.craft.kind(tree);
+      m.makeScale(tree.radius, tree.radius, TRUNK_M).setPosition(tree.x, tree.y, tree.z);
+      this.trunks.setMatrixAt(i, m);
+      this.trunks.setColorAt(i, colour.set(tree.id === this.page.selected ? k.ink : { suitable: k.tree, unsuitable: k.un, visited: k.visited, target: k.target }[kind]));
+      if (kind === "target" || tree.id === this.page.selected) {
+        this.ring.visible = true;
+        this.ring.position.set(tree.x, tree.y, tree.z + 0.05);
+        this.ring.scale.setScalar(tree.radius + 2 * tree.sigma + 0.12);
+      }
+    });
+    this.trunks.count = trees.length;
+    this.trunks.instanceMatrix.needsUpdate = true;
+    if (this.trunks.instanceColor) this.trunks.instanceColor.needsUpdate = true;
+    this.trunks.boundingSphere = null;
+    this.treesDirty = false;
+  }
+
+  placeCraft() {
+    const at = this.craft?.shown, z = this.craft?.view?.pose?.at?.[2] ?? 0;
+    this.body.visible = Boolean(at);
+    if (at) {
+      this.body.position.set(at.x, at.y, z);
+      this.body.rotation.z = at.yaw;
+    }
+    const line = this.trail.geometry.attributes.position, points = (this.craft?.trail ?? []).slice(-TRAIL_MAX);
+    points.forEach((p, i) => line.setXYZ(i, p[0], p[1], p[3] ?? z));
+    this.trail.geometry.setDrawRange(0, points.length);
+    line.needsUpdate = true;
+  }
+
+  resize() {
+    const w = this.box.clientWidth, h = this.box.clientHeight;
+    if (!w || !h) return;
+    this.renderer.setSize(w, h, false);
+    this.camera.aspect = w / h;
+    this.camera.updateProjectionMatrix();
+    this.dirty = true;
+  }
+
+  fit() {
+    const trees = (this.craft?.trees ?? []).filter((t) => Math.hypot(t.x, t.y) < 60);
+    const reach = Math.max(5, ...trees.map((t) => Math.hypot(t.x, t.y)));
+    this.controls.target.set(0, 0, 0.8);
+    this.camera.position.set(-reach * 1.5, 0, reach * 0.95);
+    this.controls.update();
+    this.dirty = true;
+  }
+
+  listen() {
+    const canvas = this.renderer.domElement, ray = new Raycaster(), at = new Vector2(), down = new Vector3();
+    canvas.addEventListener("pointerdown", (e) => down.set(e.clientX, e.clientY, 0));
+    canvas.addEventListener("pointerup", (e) => {
+      if (Math.hypot(e.clientX - down.x, e.clientY - down.y) > 6) return;
+      const box = canvas.getBoundingClientRect();
+      at.set(((e.clientX - box.left) / box.width) * 2 - 1, 1 - ((e.clientY - box.top) / box.height) * 2);
+      ray.setFromCamera(at, this.camera);
+      const hit = ray.intersectObject(this.trunks)[0];
+      this.page.select(hit ? this.craft.trees[hit.instanceId].id : null);
+    });
+  }
+
+  draw(now, moving) {
+    if (this.cloudDirty && now - (this.packedAt ?? 0) > 250) {
+      this.packedAt = now;
+      this.packCloud();
+    }
+    if (this.treesDirty) this.placeTrunks();
+    if (!moving && !this.dirty) return;
+    this.placeCraft();
+    this.pace(now);
+    this.cloud.geometry.setDrawRange(0, Math.min(this.points ?? 0, Math.round(this.budget)));
+    this.renderer.render(this.scene, this.camera);
+    // once it rests, one more frame with every point
+    this.dirty = Boolean(this.cloudDirty) || this.budget < POINTS_MAX;
+  }
+
+  /** Draw as many points as the machine shows smoothly while the view moves, all of them when it rests. */
+  pace(now) {
+    const took = now - (this.drawnAt ?? 0);
+    this.drawnAt = now;
+    this.pose ??= new Matrix4();
+    const still = this.pose.equals(this.camera.matrixWorld);
+    this.pose.copy(this.camera.matrixWorld);
+    if (still) {
+      this.stillSince ??= now;
+      if (now - this.stillSince > REST_MS) this.budget = POINTS_MAX;
+      return;
+    }
+    this.stillSince = null;
+    if (this.budget >= POINTS_MAX) this.budget = this.smooth;
+    else if (took > SLOW_MS) this.budget = Math.max(5000, this.budget * 0.6);
+    else if (took < FAST_MS) this.budget = Math.min(POINTS_MAX - 1, this.budget * 1.15);
+    this.smooth = this.budget;
+  }
+}
+
+/** Return a step that visits all of 0..n-1 (it has no divisor in common with n), near the golden section of n. */
+function stepFor(n) {
+  const common = (a, b) => (b ? common(b, a % b) : a);
+  let step = Math.max(1, Math.round(n * 0.618));
+  while (n > 1 && common(step, n) !== 1) step++;
+  return step;
+}
