@@ -203,3 +203,15 @@ def test_off_line_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyP
     world.rest(20)
     world.hub.stop()
     assert list(tmp_path.rglob("*")) == []
+
+
+def test_a_run_keeps_its_map_in_its_own_folder_and_begins_without_one(tmp_path: Path) -> None:
+    from services.cli.run import with_state
+
+    folder = tmp_path / "state"
+    folder.mkdir()
+    (folder / "map-uav1.tdmap").write_bytes(b"of the last run")
+    assert with_state(TreedockConfig(), folder).mapper.state_dir == str(folder)
+    assert not folder.exists()
+    off = TreedockConfig(mapper=MapperConfig(state_dir="off"))
+    assert with_state(off, folder).mapper.state_dir == "off"
