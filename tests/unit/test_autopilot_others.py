@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from services.navigator.autopilot.clock_check import ClockCheck
 from services.navigator.autopilot.config import AutopilotConfig
 from services.navigator.autopilot.link import Codec, MavlinkLink, read_secret
 from services.navigator.autopilot.parameters import ParameterReader, read_value, wanted
+from services.navigator.autopilot.service import Autopilot
 from tests.unit.autopilot_rig import LAND_MODE, MS, POSITION_MODE, SECOND, Rig
 
 
@@ -276,3 +278,27 @@ def test_a_wire_that_broke_is_opened_again() -> None:
         assert dead.closed
     finally:
         link.close()
+
+
+def test_the_table_of_parameters_that_differ_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    class Deaf:
+        def poll(self) -> list[tuple[Any, int]]:
+            return []
+
+        def send(self, message: Any) -> None:
+            del message
+
+        def identify(self, system: int) -> None:
+            del system
+
+    context: Any = SimpleNamespace()
+    service = Autopilot(context, AutopilotConfig(), Deaf())
+    good = {p.name: p.value for p in wanted("simulation")}
+    service.bridge.parameters.found = good | {"COM_OBL_RC_ACT": 0.0}
+    service._tell_parameters()
+    service._tell_parameters()
+    assert caplog.text.count("| COM_OBL_RC_ACT | 4 | 0 | REFUSED |") == 1
+    fine = Autopilot(context, AutopilotConfig(), Deaf())
+    fine.bridge.parameters.found = good
+    fine._tell_parameters()
+    assert caplog.text.count("REFUSED") == 1

@@ -12,6 +12,7 @@ from services.common.context import Context
 from services.navigator.autopilot.bridge import Bridge
 from services.navigator.autopilot.config import AutopilotConfig
 from services.navigator.autopilot.link import Codec, Link, MavlinkLink, open_wire, read_secret
+from services.navigator.autopilot.parameters import differences, table
 
 LOG = logging.getLogger(__name__)
 
@@ -25,6 +26,7 @@ class Autopilot:
         self.bridge = Bridge(config)
         self._identified = False
         self._note = ""
+        self._table_told = False
         self._told = 0
         """How many parameters were told to have been set."""
 
@@ -68,17 +70,26 @@ class Autopilot:
         book.counters["setpoints_sent"] = self.bridge.setpoints_sent
         book.counters["setpoints_refused"] = self.bridge.setpoints_refused
         bridge = self.bridge
+        self._tell_parameters()
         book.counters["clock_jumps"] = bridge.clocks.jumps
         if bridge.clocks.round_trip_ns is not None:
             book.counters["timesync_round_trip_us"] = bridge.clocks.round_trip_ns // 1000
         book.note("clocks", bridge.clocks.word(now_ns))
         book.note("controls", bridge.foreign.word(now_ns))
-        if bridge.parameters.changed and len(bridge.parameters.changed) != self._told:
-            self._told = len(bridge.parameters.changed)
-            was = ", ".join(f"{name} (was {value:g})" for name, value in bridge.parameters.changed.items())
-            LOG.warning("parameters set: %s; start the autopilot again, some take effect only then", was)
         book.note("link", "" if state.connected else "no word from the autopilot: is it running, is the address right?")
         book.note("wire", getattr(self._link, "failed", ""))
+
+    def _tell_parameters(self) -> None:
+        """Say once how the vehicle's parameters stand, and each time that some were set."""
+        reader, config = self.bridge.parameters, self.bridge.config
+        if reader.complete and not self._table_told and config.check_parameters:
+            self._table_told = True
+            if differences(reader.found, config.vehicle):
+                LOG.warning("parameters for a %s aircraft:\n%s", config.vehicle, table(reader.found, config.vehicle))
+        if len(reader.changed) != self._told:
+            self._told = len(reader.changed)
+            was = ", ".join(f"{name} (was {value:g})" for name, value in reader.changed.items())
+            LOG.warning("parameters set: %s; start the autopilot again, some take effect only then", was)
 
 
 def build(context: Context) -> None:
