@@ -59,6 +59,8 @@ class Mapping:
         self.revision = 0
         """Up by one whenever poses of keyframes were corrected."""
         self.why: GraphReason = "local_ba"
+        self._owed = False
+        """A large adjustment was cut short."""
         self.turns = 0
         """Up by one whenever the whole map was turned: what was computed before is void."""
         self.retired: dict[int, tuple[int, F64]] = {}
@@ -94,6 +96,9 @@ class Mapping:
             self.far.learn(atlas.points, atlas.keyframes, self.camera.array[0])
         self._cull_keyframes(k)
         self._thin()
+        if self._owed and not self.hurried():
+            self._owed = False
+            self.adjust_all(k)
 
     def _create(self, k: int) -> None:
         atlas, config = self.atlas, self.config
@@ -198,6 +203,9 @@ class Mapping:
                 adjust(problem, camera, part.free, rounds, robust)
             else:
                 adjust_large(problem, camera, part.free, rounds, robust, self.hurried)
+                if self.hurried():  # what was reached is taken, but not yet fit to say what does not fit
+                    self._owed, problem.use[:] = True, True
+                    break
             gate(chi_squares(problem, camera), problem.info, 1.0, problem.use)
         with self.step():
             if part.turns == self.turns:

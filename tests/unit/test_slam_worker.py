@@ -158,3 +158,20 @@ def settle_all(maps: LiveMaps) -> None:
     crew = maps.crew
     assert isinstance(crew, Beside)
     settle(crew)
+
+
+def test_a_large_adjustment_gives_way_to_a_keyframe_and_is_made_up_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    slam = Slam(INTRINSICS, CONFIG)
+    for k, T in enumerate(turn_on_the_spot(30, 130.0)):
+        slam.track(k * PERIOD_NS, *look(T))
+    monkeypatch.setattr("services.slam.mapping._COMPILED_KEYFRAMES", 1)
+    seen = slam.atlas.points.n.sum()
+    busy = True
+    monkeypatch.setattr(type(slam.mapping), "hurried", lambda _: busy)
+    slam.mapping.adjust_all()
+    assert slam.atlas.points.n.sum() == seen, "nothing is thrown away by an adjustment that did not come to its end"
+    busy = False
+    revision = slam.mapping.revision
+    slam.mapping.settle(int(slam.atlas.slots[-1]))
+    assert slam.mapping.revision == revision + 2, "the window's adjustment, and the one that was owed"
+    check_bookkeeping(slam)
