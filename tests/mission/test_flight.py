@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from services.evaluate.bench_avoid import meeting
 from services.evaluate.flight import Flight, obstacle_case, random_case
 from services.navigator.autopilot.bridge import Bridge
 from services.navigator.config import NavigatorConfig
@@ -149,3 +150,13 @@ def test_three_trees_then_home() -> None:
     assert flight.run() == "landed", flight.mission.reason
     assert len(flight.dock_errors) == 3
     assert np.linalg.norm(flight.px4.true_pose()[:2, 3]) < 0.7
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_somebody_who_crosses_stops_or_comes_along_is_not_touched(seed: int) -> None:
+    flight = Flight(meeting(seed))
+    flight.start()
+    assert flight.run(limit_s=240.0) == "landed", flight.mission.reason
+    assert len(flight.dock_errors) == 1
+    assert flight.touches == 0
+    assert flight.near_person_m > 0.35
