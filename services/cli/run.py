@@ -19,6 +19,7 @@ import typer
 from services.cli import scratch
 from services.cli.options import AsJson, ConfigFile, Port, Settings, loaded
 from services.common.errors import InputError
+from services.station.launch import announce, station_services, with_station
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -60,7 +61,6 @@ def run(
     """Run the whole system on this machine, in simulation unless --source says otherwise."""
     from rich.console import Console
 
-    del no_browser  # the station, which opens one, comes with its own issue
     from services.cli.mission import prepared
 
     flags = {"camera.source": source, "simulator.seed": seed, "simulator.scene": scene,
@@ -71,7 +71,7 @@ def run(
     def configured() -> TreedockConfig:
         return prepared(with_port(tree, fixed=port is not None), autopilot)
 
-    return Run(configured, Console(stderr=True), logs, expected, as_json=as_json).to_the_end()
+    return Run(configured, Console(stderr=True), logs, expected, as_json=as_json, browser=not no_browser).to_the_end()
 
 
 def with_trees(tree: TreedockConfig) -> TreedockConfig:
@@ -148,7 +148,7 @@ def services_for(tree: TreedockConfig) -> tuple[str, ...]:
     """Return the services of a run, in the order in which they start."""
     from services.cli.mission import flies, guides
 
-    chain = ("router", "camera", "slam", "mapper", "detector", "refiner")
+    chain = ("router", *station_services(), "camera", "slam", "mapper", "detector", "refiner")
     if flies(tree):
         return (*chain, "navigator", "autopilot", "simulator")
     if guides(tree):
@@ -168,7 +168,7 @@ class Run:
 
     def __init__(
         self, configured: Callable[[], TreedockConfig], console: Console, logs: Path | None, expected: int | None, *,
-        as_json: bool,
+        as_json: bool, browser: bool,
     ) -> None:  # fmt: skip
         self._configured = configured
         """Gives the configuration with the ports that are free at this moment."""
@@ -176,6 +176,7 @@ class Run:
         self._expected = expected
         self._console = console
         self._as_json = as_json
+        self._browser = browser
         self._keep_logs = logs is not None
         self._own_folder = logs is None
         self._folder = logs or scratch.made()
@@ -185,7 +186,7 @@ class Run:
     def _write_config(self) -> None:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            tree = with_state(self._tree, self._folder / "state")
+            tree = with_station(with_state(self._tree, self._folder / "state"), self._folder)
             self._config_file.write_text(tree.model_dump_json(indent=1))
         except OSError as error:
             raise InputError(f"--logs {self._folder}: cannot be written: {error.strerror}") from None
@@ -259,6 +260,7 @@ class Run:
             watch = Watch(session, self._tree.uav, lambda h: supervisor.heard(h.service, h.pid, h.state))
             with Status(watch, supervisor, self._console, self._expected) as status:
                 self._console.print(f"treedock: router on {endpoint}, logs in {self._folder}", highlight=False)
+                announce(self._console, self._folder, browser=self._browser)
                 conductor = self._conductor(watch)
                 self._watch_over(supervisor, watch, status.update, stop, conductor)
             values = self._close(watch, supervisor, time.monotonic() - begin_s, conductor)
