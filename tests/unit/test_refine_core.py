@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -155,3 +157,48 @@ def test_same_input_same_answer() -> None:
     assert second is not None
     assert first.position_map_m == second.position_map_m
     assert np.array_equal(first.covariance, second.covariance)
+
+
+@pytest.mark.parametrize("slope", [(0.36, 0.0), (-0.36, 0.1), (0.1, -0.4)])
+def test_steep_ground(slope: tuple[float, float]) -> None:
+    cone = Cone(2.2, -0.2, 0.1, bottom=-3.0)
+    z = slope[0] * cone.x + slope[1] * cone.y
+    depth = sensed(render([cone], camera_at(), slope=slope), 14)
+    expected = replace(cone.expected(shift=(0.04, 0.04)), z_m=z)
+    measured = refine(depth, CAMERA, camera_at(), POSE_COVARIANCE, expected, [], CONFIG)
+    assert measured is not None
+    assert _centre_error(measured, cone) < 0.02
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_undergrowth_before_the_trunk(seed: int) -> None:
+    """Leaves at any depth up to a metre high, before and behind, hide four fifths of the lower half."""
+    cone = Cone(2.2, 0.1, 0.1)
+    rng = np.random.default_rng(seed)
+    depth = render([cone], camera_at())
+    for _ in range(260):
+        u, v, size = int(rng.integers(0, 620)), int(rng.integers(300, 470)), int(rng.integers(4, 22))
+        near = rng.uniform(1.2, 3.5)
+        patch = depth[v : v + size, u : u + size]
+        np.minimum(patch, near, out=patch)
+    measured = refine(sensed(depth, seed), CAMERA, camera_at(), POSE_COVARIANCE, cone.expected(), [], CONFIG)
+    assert measured is not None
+    assert _centre_error(measured, cone) < 0.02
+    assert abs(measured.radius_m - cone.radius) < 0.01
+
+
+def test_depth_told_in_the_wrong_unit_is_not_measured() -> None:
+    cone = Cone(2.0, 0.1, 0.1)
+    for factor in (0.2, 0.5, 2.0, 5.0):
+        depth = sensed(render([cone], camera_at()), 15) * np.float32(factor)
+        assert refine(depth, CAMERA, camera_at(), POSE_COVARIANCE, cone.expected(), [], CONFIG) is None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_is_no_tree(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    expected = Cone(2.0, 0.0, 0.1).expected()
+    speckle = rng.uniform(0.5, 6.0, (480, 640)).astype(np.float32)
+    assert refine(speckle, CAMERA, camera_at(), POSE_COVARIANCE, expected, [], CONFIG) is None
+    wall = (2.0 + 0.02 * rng.normal(size=(480, 640))).astype(np.float32)
+    assert refine(wall, CAMERA, camera_at(), POSE_COVARIANCE, expected, [], CONFIG) is None

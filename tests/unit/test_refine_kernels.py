@@ -1,11 +1,21 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from services.common.geometry import exp_rotation, level_camera
 from services.detector.refine import kernels_fit as kf
+from services.detector.refine import kernels_scan as ks
+from services.detector.refine.config import SearchConfig
+from services.detector.refine.kernels_object import object_edges
+from services.detector.refine.kernels_place import polar
+from services.detector.refine.model import ExpectedTree, inverse_2x2, largest_eigenvalue_2x2
+from services.detector.refine.view import project, sight, window
+from tests.unit.refine_scene import CAMERA
 
 
 def _numeric(point: np.ndarray, p: np.ndarray, step: float = 1e-7) -> np.ndarray:
@@ -80,3 +90,79 @@ def test_fit_is_unbiased_under_noise_along_the_ray(radius: float) -> None:
     mean = np.mean(errors, axis=0)
     assert abs(mean[2]) < 0.003
     assert np.hypot(mean[0], mean[1]) < 0.004
+
+
+@settings(deadline=None, derandomize=True)  # the first call compiles
+@given(yaw=st.floats(-3.0, 3.0), pitch=st.floats(-0.6, 0.6), lean=st.tuples(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)))
+def test_frame_along_a_trunk(yaw: float, pitch: float, lean: tuple[float, float]) -> None:
+    T = level_camera((0.3, -0.2, 1.4), yaw)
+    T[:3, :3] = T[:3, :3] @ exp_rotation([pitch, 0.0, 0.0])
+    a = np.array([*lean, 1.0]) / np.linalg.norm([*lean, 1.0])
+    view = sight(T, (float(a[0]), float(a[1]), float(a[2])))
+    assert view is not None
+    assert np.allclose(view.basis @ view.basis.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(view.basis) == pytest.approx(1.0)
+    assert np.allclose(view.basis[2], a)
+    assert view.basis[0, :2] @ view.forward > 0.0
+    assert np.allclose(view.M, view.basis @ T[:3, :3])
+
+
+def test_polar_is_the_axis_at_the_cameras_height_with_its_covariance() -> None:
+    rng = np.random.default_rng(5)
+    a = np.array([0.1, -0.15, 1.0]) / np.linalg.norm([0.1, -0.15, 1.0])
+    view = sight(level_camera((0.0, 0.0, 0.0), 0.3), (float(a[0]), float(a[1]), float(a[2])))
+    assert view is not None
+    p = np.array([2.0, 0.2, 0.1, 0.02, -0.03])
+    A = rng.normal(size=(5, 5)) * 0.001
+
+    def place(q: np.ndarray) -> np.ndarray:
+        offset, c3, c3p = np.empty(2), np.empty((3, 3)), np.empty((3, 3))
+        distance = polar(q, A @ A.T, view.basis, 0.0, offset, c3, c3p)
+        assert distance == pytest.approx(np.hypot(*offset))
+        return np.array([np.arctan2(offset[1], offset[0]), distance, q[2]])
+
+    J = np.stack([(place(p + e) - place(p - e)) / 2e-6 for e in np.eye(5) * 1e-6], axis=1)
+    offset, in_map, in_polar = np.empty(2), np.empty((3, 3)), np.empty((3, 3))
+    polar(p, A @ A.T, view.basis, 0.0, offset, in_map, in_polar)
+    assert np.allclose(in_polar, J @ A @ A.T @ J.T, rtol=1e-4, atol=1e-12)
+    axis = p[0] * view.basis[0] + p[1] * view.basis[1]
+    along = p[3] * view.basis[0] + p[4] * view.basis[1] + view.basis[2]
+    assert np.allclose(offset, (axis - axis[2] / along[2] * along)[:2])
+
+
+def test_window_holds_the_trunk_and_is_none_behind_the_camera() -> None:
+    config = SearchConfig()
+    T = level_camera((0.0, 0.0, 1.5), 0.2)
+    tree = ExpectedTree(0, 2.0, 0.5, 0.0, (0.0, 0.0, 1.0), 0.1, 0.05, 0.01)
+    bounds = window(tree, T, CAMERA, 0.3, config)
+    assert bounds is not None
+    heights = np.linspace(config.min_height_m, config.max_height_m, 20)
+    for side in (-0.3, 0.3):
+        points = np.stack([np.full(20, 2.0), np.full(20, 0.5 + side), heights], axis=1)
+        pixels = project((points - T[:3, 3]) @ T[:3, :3], CAMERA)
+        seen = (pixels[:, 1] >= 0) & (pixels[:, 1] < CAMERA.height)
+        assert np.all((pixels[seen, 0] >= bounds[0] - 1) & (pixels[seen, 0] <= bounds[1] + 1))
+    assert window(replace(tree, x_m=-2.0, y_m=-0.5), T, CAMERA, 0.3, config) is None
+
+
+def test_edges_are_those_before_background_only() -> None:
+    runs = np.zeros((3, ks.RUN_COLUMNS))
+    for k, (left, right) in enumerate(
+        [(ks.SILHOUETTE, ks.OCCLUDED), (ks.HOLE, ks.BORDER), (ks.OCCLUDED, ks.SILHOUETTE)]
+    ):
+        runs[k, ks.ROW], runs[k, ks.FIRST], runs[k, ks.LAST] = 10 * k, 100, 150
+        runs[k, ks.LEFT_KIND], runs[k, ks.RIGHT_KIND] = left, right
+    edges = np.empty((6, 3), np.int64)
+    n = object_edges(runs, np.zeros(3, np.int64), 0, edges)
+    assert edges[:n].tolist() == [[0, 100, -1], [20, -1, 150]]
+
+
+def test_inverse_by_cholesky() -> None:
+    A = np.random.default_rng(3).normal(size=(5, 5))
+    H, inverse = A @ A.T + np.eye(5), np.empty((5, 5))
+    assert kf.invert(H, inverse)
+    assert np.allclose(inverse, np.linalg.inv(H))
+    assert not kf.invert(-H, inverse)
+    m = np.array([[2.0, 0.5], [0.5, 1.0]])
+    assert np.allclose(inverse_2x2(m), np.linalg.inv(m))
+    assert largest_eigenvalue_2x2(m) == pytest.approx(float(np.linalg.eigvalsh(m)[-1]))

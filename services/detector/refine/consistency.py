@@ -3,8 +3,9 @@
 Depth gives the range along the optical axis whatever the focal length; the sideways part is scaled by focal length true
 over told, ``s``. Of a tree at the bearing b the range then comes out as ``r sqrt(cos(b)^2 + s^2 sin(b)^2)``, about
 ``r (1 + a sin(b)^2)`` with ``a = (s^2 - 1) / 2``; a principal point told too far to the right by ``d`` (of the focal
-length) adds ``d sin(b) cos(b)``, b positive to the left. So measured over mapped range, less its mean in each pass of a tree, is fitted by ``sin(b)`` and
-``sin(b)^2``. Slam absorbs a part of it, so that the coefficients name a fault, and its direction, not its size.
+length) adds ``d sin(b) cos(b)``, b positive to the left. So measured over mapped range, less its mean in each pass of a
+tree, is fitted by ``sin(b)`` and ``sin(b)^2``. Slam absorbs a part of it, so that the coefficients name a fault, and its
+direction, not its size.
 """
 
 from __future__ import annotations
