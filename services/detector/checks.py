@@ -146,3 +146,10 @@ def seen_from_eye(p_m: Floats, eye_m: Floats, voxels: Voxels, above_m: Floats32)
     steep = d[:, 2] / np.maximum(np.hypot(d[:, 0], d[:, 1]), 0.5)
     to = p_m - eye_m
     return bool(to[2] / max(float(np.hypot(to[0], to[1])), 0.5) < 0.9 * float(np.percentile(steep, 99.0)))
+
+
+def warm_checks() -> None:
+    """Run the kernels that a plain cloud does not come to."""
+    above = np.zeros((2, 3), dtype=np.float32)
+    _top_bands(above, 0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0, np.zeros(4, dtype=np.int64))
+    _places_above(above, 0.0, 0.0, 0.0, 1.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -25,6 +26,21 @@ class TrackedTree:
     """(3,) where its base should be now: the last position, moved with the map."""
 
 
+@dataclass(frozen=True, slots=True)
+class TreeEvent:
+    """What became of a tree from one update to the next."""
+
+    kind: Literal["appeared", "merged", "split", "gone"]
+    tree_id: int
+    other_id: int | None = None
+    """merged: the tree it went into; split: the tree it came from."""
+
+    def __str__(self) -> str:
+        words = {"appeared": "is new", "merged": "went into tree", "split": "came apart from tree", "gone": "is gone"}
+        other = "" if self.other_id is None else f" {self.other_id}"
+        return f"tree {self.tree_id} {words[self.kind]}{other}"
+
+
 class Identities:
     """Gives detections stable ids."""
 
@@ -37,32 +53,69 @@ class Identities:
         """Forget all trees (a new map); ids are never used again."""
         self.trees = []
 
-    def update(self, trunks: Sequence[Trunk]) -> None:
-        """Match a whole new detection: nearest pairs first, each side once."""
+    def update(self, trunks: Sequence[Trunk]) -> list[TreeEvent]:
+        """Match a whole new detection, nearest pairs first, each side once; return what happened to whom.
+
+        Two trees that became one trunk are merged at once, under the id that fits better; a trunk that was not seen is kept
+        for a few updates, because a look from elsewhere may miss it.
+        """
         pairs = sorted(
             (self._distance(tree, trunk), i, j)
             for i, tree in enumerate(self.trees)
             for j, trunk in enumerate(trunks)
             if self._alike(tree, trunk)
         )
-        matched_trees: set[int] = set()
-        matched_trunks: set[int] = set()
+        owner: dict[int, TrackedTree] = {}
+        """Tree of each trunk."""
+        matched: set[int] = set()
+        before = {tree.tree_id: tree.trunk.radius_m for tree in self.trees}
         for _, i, j in pairs:
-            if i in matched_trees or j in matched_trunks:
+            if i in matched or j in owner:
                 continue
-            matched_trees.add(i)
-            matched_trunks.add(j)
-            tree = self.trees[i]
+            matched.add(i)
+            tree = owner[j] = self.trees[i]
             tree.trunk, tree.missed, tree.observations = trunks[j], 0, tree.observations + 1
             tree.expected_m = np.array(trunks[j].base_m)
-        for i, tree in enumerate(self.trees):
-            if i not in matched_trees:
-                tree.missed += 1
-        self.trees = [t for t in self.trees if t.missed < self._config.forget_after]
+        events = self._lost([tree for i, tree in enumerate(self.trees) if i not in matched], trunks, owner)
+        events += self._begun(trunks, owner, before)
+        return events
+
+    def _lost(
+        self, lost: Sequence[TrackedTree], trunks: Sequence[Trunk], owner: dict[int, TrackedTree]
+    ) -> list[TreeEvent]:
+        """Count misses; withdraw what went into another tree, or was missed too often."""
+        events: list[TreeEvent] = []
+        for tree in lost:
+            tree.missed += 1
+            into = next((o for j, o in owner.items() if self._distance(tree, trunks[j]) < trunks[j].radius_m), None)
+            if into is not None:
+                events.append(TreeEvent("merged", tree.tree_id, into.tree_id))
+            elif tree.missed >= self._config.forget_after:
+                events.append(TreeEvent("gone", tree.tree_id))
+        withdrawn = {event.tree_id for event in events}
+        self.trees = [t for t in self.trees if t.tree_id not in withdrawn]
+        return events
+
+    def _begun(
+        self, trunks: Sequence[Trunk], owner: dict[int, TrackedTree], before: dict[int, float]
+    ) -> list[TreeEvent]:
+        """Give ids to trunks that have none; one that stands where a thicker tree was said to stand came apart from it."""
+        events = []
         for j, trunk in enumerate(trunks):
-            if j not in matched_trunks:
-                self.trees.append(TrackedTree(self._next, trunk, 1, 0, np.array(trunk.base_m)))
-                self._next += 1
+            if j in owner:
+                continue
+            new = TrackedTree(self._next, trunk, 1, 0, np.array(trunk.base_m))
+            self._next += 1
+            origin = next(
+                (o for o in owner.values() if o.tree_id in before
+                 and self._distance(new, o.trunk) < before[o.tree_id] + trunk.radius_m < 2.0 * before[o.tree_id]), None,
+            )  # fmt: skip
+            self.trees.append(new)
+            if origin is not None:
+                events.append(TreeEvent("split", new.tree_id, origin.tree_id))
+            else:
+                events.append(TreeEvent("appeared", new.tree_id))
+        return events
 
     def _alike(self, tree: TrackedTree, trunk: Trunk) -> bool:
         a, b = tree.trunk.radius_m, trunk.radius_m

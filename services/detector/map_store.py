@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from schemas.mapping import MapIndex, Submap
 from services.common.geometry import inverse
+from services.detector.incremental import Cells, cells_of
 from services.detector.model import Floats, Views
 
 _PATIENCE_S = (2.0, 30.0)
@@ -26,6 +27,8 @@ class _Held:
     tan_half: tuple[float, float] = (0.0, 0.0)
     placed_by: int = 0
     """Version of the graph that placed it."""
+    cells: Cells = frozenset()
+    """Of the plan, that its points are in."""
 
 
 class MapStore:
@@ -36,6 +39,7 @@ class MapStore:
         self.graph_version = 0
         self.changed_points = 0
         """Points that came, went or moved since ``settle``."""
+        self._touched: Cells = frozenset()
         self._epoch: int | None = None
         """The run of the mapper whose versions these are; None until an index told."""
         self._absent: set[int] = set()
@@ -49,26 +53,27 @@ class MapStore:
     def clear(self, map_id: str) -> None:
         """Begin a new map."""
         self.map_id, self.graph_version, self._held = map_id, 0, {}
-        self.changed_points = 0
+        self.changed_points, self._touched = 0, frozenset()
         self._patience_s, self._not_before_ns = _PATIENCE_S[0], 0
 
-    def settle(self) -> None:
-        """Note that all changes have been looked at."""
-        self.changed_points = 0
+    def settle(self) -> Cells:
+        """Note that all changes have been looked at; return the cells of the plan that they touched."""
+        touched, self._touched, self.changed_points = self._touched, frozenset(), 0
+        return touched
 
     def take(self, submap: Submap) -> bool:
         """Take up a submap message; return False when its points are missing here (ask for the whole map)."""
         self.graph_version = max(self.graph_version, submap.graph_version)
         held = self._held.get(submap.submap_id)
         if submap.removed:
-            gone = self._held.pop(submap.submap_id, None)
-            self.changed_points += len(gone.local_m) if gone else 0
+            self._drop({submap.submap_id} & set(self._held))
             return True
         if len(submap.points_m) == 0 and (held is None or held.version != submap.version):
             return False
         if held is not None and (submap.version, submap.graph_version) < (held.version, held.placed_by):
             return True  # an answer to a query that a newer delta has overtaken
         T = submap.T_map_submap
+        self._touched |= held.cells if held is not None else frozenset()
         if held is None or held.version != submap.version:
             held = _Held(
                 submap.version, T, submap.points_m, _placed(submap.points_m, T), submap.view.astype(np.int32),
@@ -78,6 +83,8 @@ class MapStore:
         else:
             held.T_map_submap, held.map_m = T, _placed(held.local_m, T)
         held.placed_by = submap.graph_version
+        held.cells = cells_of(held.map_m)
+        self._touched |= held.cells
         self.changed_points += len(held.local_m)
         return True
 
@@ -112,7 +119,9 @@ class MapStore:
 
     def _drop(self, submap_ids: set[int]) -> None:
         for submap_id in submap_ids:
-            self.changed_points += len(self._held.pop(submap_id).local_m)
+            gone = self._held.pop(submap_id)
+            self.changed_points += len(gone.local_m)
+            self._touched |= gone.cells
 
     def assemble(self) -> tuple[NDArray[np.float32], Views]:
         """Return all points in the map frame (N, 3) and their views."""

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import logging
+
 from schemas.codec import Wire
 from schemas.mapping import MapIndex, Submap
 from schemas.topics import MAP_CLOUD, MAP_INDEX, SLAM_POSE, TREES_LIST, TREES_TARGET
 from schemas.trees import Target, Tree, TreeList
 from services.common.context import Context
 from services.detector.config import DetectorServiceConfig
-from services.detector.detect import detect_trees
 from services.detector.fusion import Fusion
 from services.detector.identity import Identities
+from services.detector.incremental import Incremental
 from services.detector.map_store import MapStore, anchor_of, moved_with
 from services.detector.model import DetectionResult, Floats
 from services.detector.report import as_tree
+
+LOG = logging.getLogger(__name__)
 
 _ASK_TIMEOUT_S = 2.0
 
@@ -34,8 +38,7 @@ class DetectorService:
         self._incomplete = False
         self._version = 0
         self._published: TreeList | None = None
-        self.result: DetectionResult | None = None
-        """Of the last detection, for explanations."""
+        self._incremental = Incremental(config.slicing)
         context.on(MAP_CLOUD, self.on_submap)
         context.on(MAP_INDEX, self.on_index)
         context.on(SLAM_POSE, self._fusion.on_pose)
@@ -72,6 +75,9 @@ class DetectorService:
         if self._store.changed_points > 0:
             self._detect()
             self._publish()
+        elif self._incremental.partial:  # nothing came since: time to look at the whole
+            self._detect(whole=True)
+            self._publish()
         elif self._refined and self._published is not None:
             age_s = (self._context.clock.now_ns() - self._published.stamp_ns) * 1e-9
             if age_s >= self._config.fusion.publish_every_s:
@@ -79,8 +85,8 @@ class DetectorService:
 
     def final_trees(self) -> list[Tree]:
         """Return the trees of the map as it is now; those that the last look at it did not confirm are left out."""
-        if self._store.changed_points > 0:
-            self._detect()
+        if self._store.changed_points > 0 or self._incremental.partial:
+            self._detect(whole=True)
         return self._trees(confirmed=True)
 
     def state(self) -> list[Wire]:
@@ -91,6 +97,7 @@ class DetectorService:
         """Forget the old map."""
         self._store.clear(map_id)
         self._identities.clear()
+        self._incremental.clear()
         self._fusion.clear(map_id)
         self._anchored = {}
 
@@ -102,17 +109,27 @@ class DetectorService:
             if submap.map_id == self._store.map_id and len(submap.points_m) > 0:
                 self._store.take(submap)
 
-    def _detect(self) -> None:
+    @property
+    def result(self) -> DetectionResult | None:
+        """The last detection, for explanations."""
+        return self._incremental.result
+
+    def _detect(self, *, whole: bool = False) -> None:
         health = self._context.health
         self._follow_corrections()
         with health.timed("assemble"):
             points, views = self._store.assemble()
-        self._store.settle()
+        touched = self._store.settle()
         with health.timed("detect"):
-            self.result = detect_trees(points, (0.0, 0.0, 1.0), views, self._config.slicing)
-        self._identities.update(self.result.trunks)
+            if whole:
+                result = self._incremental.whole(points, views)
+            else:
+                result = self._incremental.update(points, views, touched)
+        for event in self._identities.update(result.trunks):
+            health.count(f"trees_{event.kind}")
+            LOG.info("%s", event)
         self._anchored = dict(self._store.poses())
-        health.count("detections")
+        health.count("partial_detections" if self._incremental.partial else "detections")
 
     def _follow_corrections(self) -> None:
         """Move the expected place of each tree with the submap that sees it best."""

@@ -7,6 +7,7 @@ import numpy as np
 
 def warm() -> None:
     """Run every kernel on a small cloud, for both kinds of float, with and without views."""
+    from services.detector.checks import warm_checks
     from services.detector.detect import detect_trees
     from services.detector.model import Views
 
@@ -15,6 +16,7 @@ def warm() -> None:
     x, y = (v.ravel() for v in np.meshgrid(np.linspace(-1.0, 1.0, 41), np.linspace(-1.0, 1.0, 41)))
     cloud = np.concatenate([stem, np.stack([x, y, np.zeros_like(x)], axis=1)])
     origins = np.tile(np.array([[3.0, 0.0, 1.5]]), (len(cloud), 1))
+    warm_checks()
     for kind in (np.float32, np.float64):
         detect_trees(cloud.astype(kind))
         detect_trees(cloud.astype(kind), views=Views.of_points(origins))

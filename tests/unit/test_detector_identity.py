@@ -80,3 +80,18 @@ def test_ids_follow_a_map_correction() -> None:
         1: round(4 * s, 2),
         2: round(4 * s + 0.7 * c, 2),
     }
+
+
+def test_what_happens_to_trees_is_told() -> None:
+    ids = Identities(DetectorServiceConfig(forget_after=2))
+    assert [(e.kind, e.tree_id) for e in ids.update([_trunk(1, 0, 0.12), _trunk(1.2, 0, 0.12)])] == [
+        ("appeared", 1), ("appeared", 2),
+    ]  # fmt: skip
+    (merged,) = ids.update([_trunk(1.08, 0, 0.2)])
+    assert (merged.kind, merged.tree_id, merged.other_id) == ("merged", 2, 1)
+    assert [t.tree_id for t in ids.trees] == [1], "at once, not after some misses"
+    (split,) = ids.update([_trunk(1.0, 0, 0.12), _trunk(1.2, 0, 0.12)])
+    assert (split.kind, split.tree_id, split.other_id) == ("split", 3, 1)
+    assert ids.update([_trunk(1.0, 0, 0.12)]) == [], "missed once is not gone"
+    (gone,) = ids.update([_trunk(1.0, 0, 0.12)])
+    assert str(gone) == "tree 3 is gone"
