@@ -175,3 +175,19 @@ def test_a_large_adjustment_gives_way_to_a_keyframe_and_is_made_up_for(monkeypat
     slam.mapping.settle(int(slam.atlas.slots[-1]))
     assert slam.mapping.revision == revision + 2, "the window's adjustment, and the one that was owed"
     check_bookkeeping(slam)
+
+
+def test_what_has_fallen_behind_is_thinned_and_the_way_remains(monkeypatch: pytest.MonkeyPatch) -> None:
+    poses = turn_on_the_spot(26, 52.0)
+    counts = []
+    for behind in (1000, 6):
+        monkeypatch.setattr("services.slam.mapping._BEHIND", behind)
+        slam = Slam(INTRINSICS, CONFIG.model_copy(update={"keyframe_ratio": 1.0}))  # a keyframe almost every frame
+        results = [slam.track(k * PERIOD_NS, *look(T), np.array([0.0, -9.81, 0.0])) for k, T in enumerate(poses)]
+        assert all(r.status == "tracking" for r in results)
+        counts.append(len(slam.atlas.slots))
+        check_bookkeeping(slam)
+    assert counts[1] < counts[0]
+    metres, rad = errors([T for _, T in slam.final_trajectory()], poses)
+    assert metres < 0.05
+    assert np.degrees(rad) < 1.0
