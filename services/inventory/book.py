@@ -66,9 +66,19 @@ class Inventory:
 
     # -- flights
 
-    def take(self, uav: str, trees: TreeList, now_ns: int, visited: frozenset[int] = frozenset()) -> Flight:
-        """Take a flight's newest list; ``visited``: ids that the aircraft has docked at. Older lists change nothing."""
-        flight = self._flight(uav, trees, now_ns)
+    def take(
+        self, uav: str, trees: TreeList, now_ns: int, visited: frozenset[int] = frozenset(), *, in_air: bool = False
+    ) -> Flight:
+        """Take a flight's newest list. Older ones change nothing.
+
+        Args:
+            uav: the aircraft.
+            trees: the list.
+            now_ns: the time now, for the history.
+            visited: ids that the aircraft has docked at.
+            in_air: the map was begun in the air, so that it does not begin at the start point.
+        """
+        flight = self._flight(uav, trees, now_ns, in_air=in_air)
         if trees.stamp_ns < flight.stamp_ns:
             return flight
         flight.stamp_ns, flight.version, flight.last_ns = trees.stamp_ns, trees.version, now_ns
@@ -87,7 +97,7 @@ class Inventory:
             self._refresh(fid, now_ns)
         return flight
 
-    def _flight(self, uav: str, trees: TreeList, now_ns: int) -> Flight:
+    def _flight(self, uav: str, trees: TreeList, now_ns: int, *, in_air: bool) -> Flight:
         """Return the flight of a list: known, or a new run when its time ran back (a simulation that began anew)."""
         same = [f for f in self.flights.values() if f.uav == uav and f.map_id == trees.map_id]
         newest = max(same, key=lambda f: f.run, default=None)
@@ -95,17 +105,17 @@ class Inventory:
             return newest
         fid = max(self.flights, default=0) + 1
         run = 1 if newest is None else newest.run + 1
-        flight = self._new_flight(fid, uav, trees.map_id, run, now_ns)
+        flight = self._new_flight(fid, uav, trees.map_id, run, now_ns, in_air=in_air)
         self.flights[fid] = self.changes.flights[fid] = flight
         self._of_flight[fid] = {}
         return flight
 
-    def _new_flight(self, fid: int, uav: str, map_id: str, run: int, now_ns: int) -> Flight:
+    def _new_flight(self, fid: int, uav: str, map_id: str, run: int, now_ns: int, *, in_air: bool) -> Flight:
         start = self._config.start_of(uav)
-        if start is None:
+        if start is None or in_air:
             site = self._new_site("local")
             return Flight(fid, uav, map_id, run, "local", site.number, Rigid2(), 0.0, 0.0, aligned=False,
-                          first_ns=now_ns, last_ns=now_ns, note="no start point: local coordinates")  # fmt: skip
+                          first_ns=now_ns, last_ns=now_ns, note=f"{'begun in the air' if in_air else 'no start point'}: local coordinates")  # fmt: skip
         site = next((s for s in self.sites.values() if s.frame == "global"), None) or self._new_site("global", start)
         plane = TangentPlane(site.latitude_deg, site.longitude_deg, site.altitude_m)
         place = place_of_start(plane, start.latitude_deg, start.longitude_deg, start.altitude_m, start.heading_deg)
@@ -291,15 +301,16 @@ class Inventory:
     def _sites_to_try(self, flight: Flight) -> list[int]:
         if flight.frame == "global":
             return [flight.site]
-        occupied = {f.site for f in self.flights.values() if f.frame == "local" and f.fid != flight.fid}
-        return sorted(site for site in occupied if site < flight.site)  # the older one stays where it is
+        occupied = {f.site for f in self.flights.values() if f.fid != flight.fid}
+        # the older one stays where it is, but whatever lies on the globe stays there
+        return sorted(s for s in occupied if s != flight.site and (s < flight.site or self.sites[s].frame == "global"))
 
     def _join(self, flight: Flight, site: int, found: Alignment, now_ns: int) -> None:
         """Move the flight into the site by what was found, and its trees onto the trees there."""
         place = flight.place
         x, y, _ = Rigid2(found.theta_rad, *found.shift_m).apply(place.x_m, place.y_m, 0.0)
         flight.place = replace(place, theta_rad=place.theta_rad + found.theta_rad, x_m=x, y_m=y)
-        flight.site, flight.aligned = site, True
+        flight.site, flight.frame, flight.aligned = site, self.sites[site].frame, True
         flight.sigma_m, flight.sigma_heading_rad = max(found.rms_m, 0.02), 0.01
         where = "" if flight.frame == "global" else "; local coordinates"
         flight.note = f"laid on the inventory by {found.agreeing} trees, {found.rms_m:.2f} m{where}"
@@ -319,6 +330,8 @@ class Inventory:
     def _move_trees(self, flight: Flight, sightings: list[Sighting]) -> None:
         for sighting in sightings:
             tree = self.trees[sighting.tree]
+            if tree.frame == "local" and flight.frame == "global":
+                self.changes.placed.append(tree.fid)
             tree.site, tree.frame = flight.site, flight.frame
             self.changes.trees[tree.fid] = tree
 

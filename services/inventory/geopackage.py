@@ -153,6 +153,7 @@ class GeoPackage:
                 ("sightings", changes.sightings),
             ):
                 self._upsert(table, [_ROWS[table](value) for value in values.values()])
+            db.executemany(f"DELETE FROM {schema.LOCAL_TABLE} WHERE fid = ?", [(fid,) for fid in changes.placed])
             self._write_trees(list(changes.trees.values()), sites)
             self._append("measurements", [schema.measurement_row(m) for m in changes.measurements])
             self._append("events", [schema.event_row(e) for e in changes.audit])

@@ -32,10 +32,11 @@ Tone = Literal["info", "good", "bad"]
 
 @dataclass(frozen=True, slots=True)
 class Offered:
-    """A flight's newest list, and the trees that it has docked at."""
+    """A flight's newest list, the trees that it has docked at, and whether its map was begun in the air."""
 
     trees: TreeList
     visited: frozenset[int]
+    in_air: bool
 
 
 class Keeper:
@@ -64,10 +65,10 @@ class Keeper:
         """Begin."""
         self._thread.start()
 
-    def offer(self, uav: str, trees: TreeList, visited: frozenset[int]) -> None:
+    def offer(self, uav: str, trees: TreeList, visited: frozenset[int], *, in_air: bool = False) -> None:
         """Leave a flight's newest list; returns at once."""
         with self._lock:
-            self._offered[uav, trees.map_id] = Offered(trees, visited)
+            self._offered[uav, trees.map_id] = Offered(trees, visited, in_air)
 
     def audit(self, line: AuditLine) -> None:
         """Leave a line of the log; returns at once."""
@@ -93,7 +94,7 @@ class Keeper:
             offered, self._offered = self._offered, {}
             audit, self._audit = self._audit, []
         for (uav, _), item in offered.items():
-            flight = self.inventory.take(uav, item.trees, now_ns, item.visited)
+            flight = self.inventory.take(uav, item.trees, now_ns, item.visited, in_air=item.in_air)
             if self._notes.get(flight.fid) != flight.note:
                 self._notes[flight.fid] = flight.note
                 self._tell(f"inventory: {uav}, flight {flight.fid}: {flight.note}", "info")

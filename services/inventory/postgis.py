@@ -84,6 +84,9 @@ class PostGis:
             self._upsert(cursor, "sites", [schema.site_row(v) for v in changes.sites.values()])
             self._upsert(cursor, "flights", [schema.flight_row(v) for v in changes.flights.values()])
             self._upsert(cursor, "sightings", [schema.sighting_row(v) for v in changes.sightings.values()])
+            if changes.placed:
+                sql = f"DELETE FROM {schema.LOCAL_TABLE} WHERE fid = %s"
+                cursor.executemany(sql, [(fid,) for fid in changes.placed])
             for table, frame in ((schema.GLOBAL_TABLE, "global"), (schema.LOCAL_TABLE, "local")):
                 rows = []
                 for tree in changes.trees.values():

@@ -156,6 +156,8 @@ class Changes:
     trees: dict[int, InventoryTree] = field(default_factory=dict)
     measurements: list[Measurement] = field(default_factory=list)
     audit: list[AuditLine] = field(default_factory=list)
+    placed: list[int] = field(default_factory=list)
+    """Trees that were local and are global now: they leave the one table for the other."""
 
     def add(self, later: Changes) -> None:
         """Take over later changes: a row written twice is written as it is last."""
@@ -165,6 +167,7 @@ class Changes:
         self.trees.update(later.trees)
         self.measurements += later.measurements
         self.audit += later.audit
+        self.placed += later.placed
 
     def __bool__(self) -> bool:
         return bool(self.sites or self.flights or self.sightings or self.trees or self.measurements or self.audit)

@@ -45,6 +45,8 @@ class Aircraft:
     live: set[str] = field(default_factory=set)
     trail: deque[TrailPoint] = field(default_factory=lambda: deque(maxlen=_TRAIL_POINTS))
     trail_map: str = ""
+    map_begun_in_air: bool = False
+    """The present map replaced another while the aircraft flew: it does not begin at the start point."""
     link_was: str = "none"
 
     def on_pose(self, pose: Pose) -> None:
@@ -54,6 +56,8 @@ class Aircraft:
             self._tell("mission", "warn" if lost else "good", f"slam: {pose.status}")
         self.pose = pose
         if pose.map_id != self.trail_map:
+            flying = self.vehicle is not None and self.vehicle.landed != "on_ground"
+            self.map_begun_in_air = flying and self.trail_map != ""
             self.trail_map = pose.map_id
             self.trail.clear()
             self.placed = None

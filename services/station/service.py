@@ -235,7 +235,8 @@ class Station:
         if self.keeper is not None and trees is not None:
             same = mission is not None and mission.map_id == trees.map_id
             visited = mission.visited_tree_ids if mission is not None and same else ()
-            self.keeper.offer(aircraft.uav, trees, frozenset(visited))
+            in_air = aircraft.map_begun_in_air and aircraft.trail_map == trees.map_id
+            self.keeper.offer(aircraft.uav, trees, frozenset(visited), in_air=in_air)
 
     def _on_preview(self, aircraft: Aircraft, message: PreviewImage) -> None:
         aircraft.links.note(PREVIEW_IMAGE, PREVIEW_IMAGE.name, time.monotonic(), None)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
 ROOT = Path(__file__).parents[2]
-CHROMIUM = os.environ.get("TREEDOCK_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser") or ""
+CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser") or ""
 
 
 @dataclass
@@ -114,7 +114,7 @@ def ground(tmp_path: Path) -> Iterator[Ground]:
 def browser() -> Iterator[Browser]:
     """Debian's Chromium, driven by playwright."""
     if not CHROMIUM:
-        pytest.skip("no chromium on this machine: apt-get install chromium, or name one with TREEDOCK_CHROMIUM")
+        pytest.skip("no chromium on this machine: apt-get install chromium, or name one with CHROMIUM")
     sync = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
     with sync.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])

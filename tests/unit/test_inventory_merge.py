@@ -219,6 +219,23 @@ def test_local_flights_join_only_when_the_pattern_is_clear_and_say_that_they_are
     assert not book.flights[3].aligned  # five trees without any prior are no proof
 
 
+def test_a_map_begun_in_the_air_is_local_until_its_trees_place_it() -> None:
+    book = Inventory(InventoryConfig(start_points=(START,)))
+    world = forest(12)
+    take(book, "uav1", listed(world), S)
+    late = seen_from(world, 1.0, 3.0, 2.0, 2)
+    book.take("uav1", listed(late[:6], map_id="m2"), 2 * S, in_air=True)
+    assert {t.frame for t in book.trees.values() if t.fid > 14} == {"local"}
+    assert "begun in the air" in book.flights[2].note
+    assert not book.join_next(2 * S) or not book.flights[2].aligned
+    book.take("uav1", listed(late, 3 * S, map_id="m2"), 3 * S)
+    while book.join_next(3 * S):
+        pass
+    assert len(present(book)) == len(world)
+    assert {book.trees[k].frame for k in present(book)} == {"global"}
+    assert len(book.written().placed) == 14
+
+
 def test_a_docked_tree_stays_visited() -> None:
     book = Inventory(InventoryConfig())
     book.take("uav1", listed([tree(1, 4.0, 0.0)]), S, frozenset({1, 77}))
