@@ -95,7 +95,8 @@ def bent(shot: Shot) -> BentShot:
         np.asarray(cv2.remap(image, at_u, at_v, cv2.INTER_NEAREST), dtype=np.float32)
         for image in (shot.sensed, shot.true)
     )
-    points = np.stack([x * true, y * true, true], axis=-1).astype(np.float64)
+    with np.errstate(invalid="ignore"):  # the sky is infinitely far
+        points = np.stack([x * true, y * true, true], axis=-1).astype(np.float64)
     return BentShot(camera, np.where(true > 0, sensed, np.float32(0.0)), points)
 
 

@@ -10,13 +10,14 @@ import pytest
 from schemas.camera import RgbdFrame
 from services.camera.codecs import decode_colour, decode_depth_m
 from services.camera.config import CameraConfig
+from services.camera.depth.config import DepthConfig
 from services.camera.sources import BadFrame, open_recording, open_source
 from services.camera.sources.ros_bag import BagSource
 from services.common.errors import InputError
 from tests.camera_data import CAMERA, colour_image, stamp_ns
 from tests.ros_bags import COLOUR, DEPTH, INFO, BagMaker, camera_messages, depth_mm
 
-CONFIG = CameraConfig(min_range_m=0.0, max_range_m=13.0)
+CONFIG = CameraConfig(min_range_m=0.0, max_range_m=13.0, depth=DepthConfig(drop_mixed=False))
 
 
 def written(tmp_path: Path, ros: int = 2, count: int = 4, form: str = "raw", **options: Any) -> Path:
