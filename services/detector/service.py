@@ -20,6 +20,8 @@ from services.detector.report import as_tree
 LOG = logging.getLogger(__name__)
 
 _ASK_TIMEOUT_S = 2.0
+_QUIET_S = 2.0
+"""When the map did not change for so long there is time to look at the whole of it."""
 
 
 class DetectorService:
@@ -39,6 +41,8 @@ class DetectorService:
         self._version = 0
         self._published: TreeList | None = None
         self._incremental = Incremental(config.slicing)
+        self._quiet = 0
+        """Timers since the map changed last."""
         context.on(MAP_CLOUD, self.on_submap)
         context.on(MAP_INDEX, self.on_index)
         context.on(SLAM_POSE, self._fusion.on_pose)
@@ -72,10 +76,11 @@ class DetectorService:
         """Detect when the map changed since the last time; else tell of what the refiner found since."""
         if self._incomplete:
             self._fetch_whole_map()
+        self._quiet = 0 if self._store.changed_points > 0 else self._quiet + 1
         if self._store.changed_points > 0:
             self._detect()
             self._publish()
-        elif self._incremental.partial:  # nothing came since: time to look at the whole
+        elif self._incremental.partial and self._quiet >= _QUIET_S * self._config.max_rate_hz:
             self._detect(whole=True)
             self._publish()
         elif self._refined and self._published is not None:

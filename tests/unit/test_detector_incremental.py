@@ -77,5 +77,5 @@ def test_ids_live_through_parts_and_a_map_correction() -> None:
     assert after.keys() == names.keys()
     for tree_id, (x, _) in names.items():
         assert after[tree_id] == pytest.approx(x + (0.3 if x > 0 else 0.0), abs=0.03)
-    system.send()
+    system.hub.advance_to(system.hub.clock.now_ns() + 4_000_000_000)
     assert not system.detector._incremental.partial, "when nothing comes, the whole is looked at"
