@@ -111,12 +111,20 @@ class Bus:
 
     # -- receiving
 
-    def subscribe(self, topic: Topic, handler: Callable[[M], None], leaf: str | None = None) -> None:
-        """Have the work loop call ``handler`` with each decoded sample."""
-        self.subscribe_keys(topic, lambda _, message: handler(message), leaf)
+    def subscribe(
+        self, topic: Topic, handler: Callable[[M], None], leaf: str | None = None, *, ring: int | None = None
+    ) -> None:
+        """Have the work loop call ``handler`` with each decoded sample; ``ring``: as many wait, not the table's."""
+        self.subscribe_keys(topic, lambda _, message: handler(message), leaf, ring=ring)
 
     def subscribe_keys(
-        self, topic: Topic, handler: Callable[[str, Any], None], leaf: str | None = None, *, at_once: bool = False
+        self,
+        topic: Topic,
+        handler: Callable[[str, Any], None],
+        leaf: str | None = None,
+        *,
+        at_once: bool = False,
+        ring: int | None = None,
     ) -> None:
         """Subscribe with the key: ``handler(key, message)``; ``at_once`` calls it on Zenoh's thread (be quick)."""
 
@@ -128,7 +136,7 @@ class Bus:
         if at_once:
             self._declare_subscriber(topic, topic.key(self.uav, leaf), deliver)
             return
-        box = self.inbox.mailbox(deliver, _ring(topic))
+        box = self.inbox.mailbox(deliver, ring or _ring(topic))
         self._boxes[topic.name] = box
         self._declare_subscriber(topic, topic.key(self.uav, leaf), lambda sample: self.inbox.put(box, sample))
 

@@ -72,7 +72,9 @@ class Context(Protocol):
         """The one clock of the service."""
         ...
 
-    def on(self, topic: Topic, handler: Callable[[M], None], leaf: str | None = None) -> None:
+    def on(
+        self, topic: Topic, handler: Callable[[M], None], leaf: str | None = None, *, ring: int | None = None
+    ) -> None:
         """Call ``handler(message)`` for each sample of ``topic`` (LATEST: only the newest), from the work loop."""
         ...
 

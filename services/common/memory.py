@@ -89,8 +89,11 @@ class MemoryContext:
         self.clock = hub.clock
         self.health = HealthBook()
 
-    def on(self, topic: Topic, handler: Callable[[M], None], leaf: str | None = None) -> None:
+    def on(
+        self, topic: Topic, handler: Callable[[M], None], leaf: str | None = None, *, ring: int | None = None
+    ) -> None:
         """Register a handler; several on one key are called in order of registration."""
+        del ring  # in memory nothing is dropped
         self._hub._handlers.setdefault(topic.key(self.uav, leaf), []).append(handler)  # noqa: SLF001 - one module
 
     def every(self, period_s: float, handler: Callable[[], None]) -> None:

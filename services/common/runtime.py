@@ -78,10 +78,12 @@ class LiveContext:
         self._wall_timers: list[_Timer] = []
         self._throttle = Throttle()
 
-    def on(self, topic: Topic, handler: Callable[[M], None], leaf: str | None = None) -> None:
+    def on(
+        self, topic: Topic, handler: Callable[[M], None], leaf: str | None = None, *, ring: int | None = None
+    ) -> None:
         """Call ``handler(message)`` for each sample."""
         self.topics_in.append(topic)
-        self.bus.subscribe(topic, self.guarded(topic.name, handler), leaf)
+        self.bus.subscribe(topic, self.guarded(topic.name, handler), leaf, ring=ring)
 
     def every(self, period_s: float, handler: Callable[[], None]) -> None:
         """Call ``handler()`` each ``period_s`` of the clock's time; first after one period."""

@@ -30,6 +30,17 @@ _CLOUD_POINTS = 100_000
 _CLOUD_PERIOD_NS = 5_000_000_000
 
 
+def warm() -> None:
+    """Import Foxglove's classes: the first message must not wait for that."""
+    import importlib
+
+    for name in ("CameraCalibration", "CompressedImage", "FrameTransform", "Log", "PackedElementField", "PointCloud",
+                 "PoseInFrame", "SceneEntityDeletion", "SceneUpdate"):  # fmt: skip
+        importlib.import_module(f"foxglove_schemas_protobuf.{name}_pb2")
+    importlib.import_module("mcap_protobuf.schema")
+    importlib.import_module("zstandard")
+
+
 class Translator:
     """Turns messages into Foxglove's; holds the image rate and the map shown."""
 

@@ -19,7 +19,7 @@ from services.common.files import make_folder, write_whole
 from services.recorder.chronicle import Chronicle
 from services.recorder.config import RecorderConfig
 from services.recorder.drain import Drain, Entry, Limits
-from services.recorder.foxglove import Translator
+from services.recorder.foxglove import Translator, warm
 from services.recorder.mcap_file import McapFile
 from services.recorder.recover import recover_folder
 
@@ -27,6 +27,8 @@ LOG = logging.getLogger(__name__)
 
 _MB = 1_000_000
 _TELL_S = 1.0
+_RING = 64
+"""Of every topic: a recorder keeps what came while it was busy, where others want the newest only."""
 
 
 def build(context: Context) -> RecorderService:
@@ -37,11 +39,13 @@ def build(context: Context) -> RecorderService:
     """
     config = context.config.recorder
     make_folder(config.folder)
+    warm()
     for mended in recover_folder(config.folder):
         LOG.info("%s", mended)
     service = RecorderService(context, config)
     for topic in recorded_topics(config):
-        context.on(topic, partial(service.take, topic), "*" if topic.name.endswith("*") else None)
+        leaf = "*" if topic.name.endswith("*") else None
+        context.on(topic, partial(service.take, topic), leaf, ring=_RING)
     context.every_wall(_TELL_S, service.tell)
     context.on_stop(service.stop)
     return service
