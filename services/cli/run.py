@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -18,8 +17,9 @@ import typer
 
 from services.cli import scratch
 from services.cli.options import AsJson, ConfigFile, Port, Settings, loaded
+from services.cli.run_plan import expected_frames, services_for, with_port, with_state, with_trees
 from services.common.errors import InputError
-from services.station.launch import announce, station_services, with_station
+from services.station.launch import announce, with_station
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -33,9 +33,6 @@ if TYPE_CHECKING:
 _EXIT_NOT_REACHED = 3
 _ROUTER_WITHIN_S = 60.0
 _LOOK_S = 0.2
-_TREES_ANYWAY = 2
-"""A scene drawn at random holds at least one tree to dock at."""
-_SIMULATED_S_A_TREE, _WALL_S_A_TREE = 120.0, 400.0
 _TRIES = 4
 
 
@@ -72,88 +69,6 @@ def run(
         return prepared(with_port(tree, fixed=port is not None), autopilot)
 
     return Run(configured, Console(stderr=True), logs, expected, as_json=as_json, browser=not no_browser).to_the_end()
-
-
-def with_trees(tree: TreedockConfig) -> TreedockConfig:
-    """Return ``tree`` with a random scene that holds as many trees as the mission is to visit, and the time for it."""
-    wanted, simulator = tree.navigator.trees_wanted, tree.simulator
-    if tree.camera.source != "sim" or wanted < _TREES_ANYWAY:
-        return tree
-    from services.simulator.catalogue import trees_to_ask_for
-
-    asked = simulator.trees
-    if asked is None:
-        asked = trees_to_ask_for(simulator.scene, simulator.seed, wanted)
-    limit_s = max(simulator.flight.limit_s, wanted * _SIMULATED_S_A_TREE)
-    within_s = max(tree.supervisor.mission_within_s, wanted * _WALL_S_A_TREE)
-    flight = simulator.flight.model_copy(update={"limit_s": limit_s})
-    return tree.model_copy(update={
-        "simulator": simulator.model_copy(update={"trees": asked, "flight": flight}),
-        "supervisor": tree.supervisor.model_copy(update={"mission_within_s": within_s}),
-    })  # fmt: skip
-
-
-def with_state(tree: TreedockConfig, folder: Path) -> TreedockConfig:
-    """Return ``tree`` with the map kept in an empty ``folder``: it outlives a service that dies, not the run."""
-    shutil.rmtree(folder, ignore_errors=True)
-    update: dict[str, object] = {}
-    if tree.mapper.state_dir == "auto":
-        update["mapper"] = tree.mapper.model_copy(update={"state_dir": str(folder)})
-    if tree.slam.map_folder is None:
-        update["slam"] = tree.slam.model_copy(update={"map_folder": folder / "slam"})
-    return tree.model_copy(update=update)
-
-
-def expected_frames(tree: TreedockConfig) -> int | None:
-    """Return how many frames the source will give, None when nobody knows.
-
-    A recording is opened for it, which also finds its faults half a minute before the camera service would; so is the
-    name of a scene looked up.
-
-    Raises:
-        InputError: a source or scene that cannot be used.
-    """
-    if tree.camera.source == "sim":
-        from services.simulator.catalogue import scene_for
-
-        scene_for(tree.simulator.scene, tree.simulator.seed, tree.simulator.trees)
-        return None
-    if tree.camera.source == "realsense":
-        from services.camera.sources.realsense import require_library
-
-        require_library()
-        return None
-    from services.camera.sources import open_source
-
-    return open_source(tree.camera.source, tree.camera).expected
-
-
-def with_port(tree: TreedockConfig, *, fixed: bool) -> TreedockConfig:
-    """Return ``tree`` with a free router port: the configured one, else, unless it is ``fixed``, any.
-
-    Raises:
-        InputError: the fixed port is taken.
-    """
-    from services.common.session import free_port, port_is_free
-
-    host, port = tree.router.host, tree.router.port
-    if port_is_free(host, port):
-        return tree
-    if fixed:
-        raise InputError(f"port {port} on {host} is in use: stop what listens there, or choose another with --port")
-    return tree.model_copy(update={"router": tree.router.model_copy(update={"port": free_port(host)})})
-
-
-def services_for(tree: TreedockConfig) -> tuple[str, ...]:
-    """Return the services of a run, in the order in which they start."""
-    from services.cli.mission import flies, guides
-
-    chain = ("router", *station_services(), "camera", "slam", "mapper", "detector", "refiner")
-    if flies(tree):
-        return (*chain, "navigator", "autopilot", "simulator")
-    if guides(tree):
-        chain = (*chain, "navigator")
-    return (*chain, "simulator") if tree.camera.source == "sim" else chain
 
 
 class _PortTakenError(InputError):

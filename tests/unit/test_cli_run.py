@@ -13,8 +13,9 @@ from rich.console import Console
 from schemas.navigation import MissionState
 from services.cli import run as run_module
 from services.cli import scratch
-from services.cli.mission import Flown
-from services.cli.run import Run, with_trees
+from services.cli.mission import Flown, prepared
+from services.cli.run import Run
+from services.cli.run_plan import services_for, with_trees
 from services.common.config import TreedockConfig
 from services.common.errors import InputError
 from services.common.stop import StopSignal
@@ -87,7 +88,7 @@ def test_a_port_lost_to_another_process_is_chosen_anew(tmp_path: Path, monkeypat
         return 0
 
     monkeypatch.setattr(Run, "_attempt", attempt)
-    made = Run(configured, Console(quiet=True), tmp_path, None, as_json=False)
+    made = Run(configured, Console(quiet=True), tmp_path, None, as_json=False, browser=False)
     assert made.to_the_end() == 0
     assert tried == [7001, 7002, 7003]
     assert '"port": 7003' in (tmp_path / "config.json").read_text()
@@ -98,3 +99,16 @@ def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
 
     assert invoke(["--version"]) == 0
     assert capsys.readouterr().out.startswith("treedock ")
+
+
+@pytest.mark.parametrize("source", ["sim", "tum:somewhere"])
+def test_handheld_guides_and_flies_nothing(source: str) -> None:
+    tree = TreedockConfig.model_validate({"camera": {"source": source}, "navigator": {"handheld": True}})
+    made = prepared(tree, "builtin")
+    services = services_for(made)
+    assert "navigator" in services
+    assert "autopilot" not in services
+    assert ("simulator" in services) is (source == "sim")
+    if source == "sim":
+        assert made.simulator.mode == "scan"
+        assert made.simulator.path.hold_s >= made.navigator.dock.window_s + 3.0

@@ -125,7 +125,7 @@ CONFIG = SimulatorConfig(
 class Bench:
     """The flying simulator on the bus in memory, with stand-ins that answer at once."""
 
-    def __init__(self) -> None:
+    def __init__(self, config: SimulatorConfig = CONFIG) -> None:
         self.hub = Hub(TreedockConfig())
         self.now_s = 0.0
         self.context = self.hub.context("simulator")
@@ -137,7 +137,7 @@ class Bench:
         self.others.on(SIM_RGBD, self._on_frame)
         self.others.on(SIM_CLOCK, self._on_clock)
         self.others.on(SIM_TRUTH, self.truths.append)
-        self.flight = Flight(cast(Context, self.context), CONFIG, wall=lambda: self.now_s)
+        self.flight = Flight(cast(Context, self.context), config, wall=lambda: self.now_s)
 
     def live(self, *names: str) -> None:
         self.hub.live.update(names)
@@ -233,3 +233,18 @@ def test_the_next_frame_waits_for_slam_and_refiner(bench: Bench) -> None:
     bench.turns(0.3)
     bench.flight._tell()
     assert "lockstep" not in bench.context.health.notes
+
+
+def test_frames_are_lost_as_asked_and_the_same_each_time() -> None:
+    lossy = CONFIG.model_copy(update={"flight": CONFIG.flight.model_copy(update={"drop_share": 0.3})})
+    stamps = []
+    for config in (CONFIG, lossy, lossy):
+        made = Bench(config)
+        made.live("camera", "slam", "mapper", "detector", "refiner", "navigator", "autopilot")
+        made.turns(4.0)
+        assert made.clocks[-1].phase == "done", "time goes on without them"
+        stamps.append([frame.stamp_ns for frame in made.frames])
+        gaps = [round((b - a) * 15e-9) for a, b in itertools.pairwise(stamps[-1])]
+        assert set(gaps) == ({1} if config is CONFIG else set(gaps) & {1, 2, 3, 4, 5})
+    assert 0.5 * len(stamps[0]) < len(stamps[1]) < 0.9 * len(stamps[0])
+    assert stamps[1] == stamps[2]
