@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +61,7 @@ class StubCloud:
 class StubMapper:
     def __init__(self, context: Context) -> None:
         del context
+        self.map = SimpleNamespace(submaps={})
 
     def cloud(self) -> StubCloud:
         return StubCloud(np.zeros((2, 3), np.float32), np.zeros((2, 3), np.uint8))
