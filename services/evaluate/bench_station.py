@@ -28,7 +28,7 @@ from services.evaluate.bench import BenchOptions, BenchReport
 from services.evaluate.station_load import Load
 
 _AIRCRAFT, _RATE_HZ, _TREES = 10, 5.0, 500
-_MEASURE_S, _QUICK_S = 30.0, 8.0
+_MEASURE_S, _QUICK_S = 20.0, 8.0
 _KILLS, _QUICK_KILLS = 100, 5
 _MOST_LOST_S = 1.0
 

@@ -128,7 +128,8 @@ class Brain:
 
     def _welcome(self, page: int, operator: Operator, now_s: float) -> None:
         self._pages.one(page, _json({"t": "welcome", "you": {"n": operator.number, "name": operator.name},
-                                     "cloud": self.config.cloud, "stale_s": self.config.view_stale_s}))  # fmt: skip
+                                     "cloud": self.config.cloud, "inventory": self.config.inventory.database != "none",
+                                     "stale_s": self.config.view_stale_s}))  # fmt: skip
         self._pages.one(page, _json({"t": "events", "items": [e.as_dict() for e in self.log.latest()], "all": True}))
         for aircraft in self.fleet.values():
             self._pages.one(page, _json({"t": "trees", **trees_view(aircraft)}))

@@ -62,6 +62,7 @@ class Page {
   onWelcome(message) {
     this.me = message.you;
     this.cloud = message.cloud;
+    this.inventory = message.inventory;
     this.view3d?.reconnected();
     text($("operator"), this.me.name);
     this.events = [];
@@ -121,6 +122,8 @@ class Page {
     $("theme").onclick = () => this.theme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
     $("operator").onclick = () => {
       $("name-input").value = this.link.name;
+      $("downloads").hidden = !this.inventory;
+      this.drawOthers();
       $("name-dialog").showModal();
     };
     $("name-dialog").addEventListener("close", () => {
@@ -140,6 +143,23 @@ class Page {
     addEventListener("keydown", (e) => {
       if (e.key.toLowerCase() === "h" && !e.repeat && !e.ctrlKey && !e.metaKey && !e.altKey && !(e.target instanceof HTMLInputElement)) this.orders.holdNow();
     });
+  }
+
+  /** Who else is there; to each of them command of this aircraft can be handed. */
+  drawOthers() {
+    const others = (this.operators ?? []).filter((o) => o.n !== this.me?.n), uav = this.craft?.uav;
+    const mine = this.craft?.view?.commander?.n === this.me?.n;
+    $("others").replaceChildren(...others.map((o) => {
+      const node = el("button", { type: "button", class: "mini" }, el("span", {}, mine ? `Hand command of ${uav} to ${o.name}` : `${o.name} is here`));
+      set(node, "aria-disabled", mine ? null : "true");
+      onHold(node, async () => {
+        if (!mine) return;
+        const reply = await this.link.ask({ t: "hand_over", uav, to: o.n });
+        this.toast(reply.accepted ? "good" : "bad", reply.reason);
+        $("name-dialog").close();
+      }, () => this.toast("info", "Keep it pressed for one second."));
+      return node;
+    }));
   }
 
   tab(name, focus = false) {

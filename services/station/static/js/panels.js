@@ -40,7 +40,7 @@ export function drawVitals(craft, now) {
 
 // -- trees
 
-const KIND_WORDS = { target: "target now", visited: "visited", suitable: "suitable", unsuitable: "not suitable" };
+const KIND_WORDS = { target: "target", visited: "visited", suitable: "suitable", unsuitable: "not suitable" };
 
 export function drawTrees(craft, page) {
   const panel = $("panel-trees"), trees = craft?.trees ?? [];
