@@ -132,6 +132,8 @@ class ConsistencyConfig(BaseModel):
     focal length 15 % too small, 0.06 to 0.09 with one 20 % too large."""
     sigmas: float = Field(default=4.0, gt=0.0)
     passes: int = Field(default=12, ge=1)
+    pass_s: float = Field(default=5.0, gt=0.0)
+    """A longer pass is cut: in the time of an approach poses drift, and the drift would be taken for a slope."""
     pass_gap_s: float = Field(default=2.0, gt=0.0)
     min_frames: int = Field(default=8, ge=3)
     min_sweep_rad: float = Field(default=0.5, gt=0.0)

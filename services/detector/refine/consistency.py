@@ -29,6 +29,7 @@ class Pass:
 
     tree_id: int
     mapped_m: Matrix
+    first_ns: int
     last_ns: int = 0
     low_rad: float = math.inf
     high_rad: float = -math.inf
@@ -82,10 +83,11 @@ class MapConsistency:
         """
         last = self._passes[-1] if self._passes else None
         late = last is None or stamp_ns - last.last_ns > self._config.pass_gap_s * 1e9
+        late = late or (last is not None and stamp_ns - last.first_ns > self._config.pass_s * 1e9)
         if last is None or late or self._broken or last.tree_id != tree_id:
             if last is not None and not self._useful(last):
                 self._passes.pop()
-            last = Pass(tree_id, mapped_m)
+            last = Pass(tree_id, mapped_m, stamp_ns)
             self._passes.append(last)
             self._broken = False
         last.add(stamp_ns, bearing_rad, range_m / float(np.hypot(*(last.mapped_m - camera_m))) - 1.0)
