@@ -7,9 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from schemas.mapping import Submap
 from schemas.simulation import TrueTree
+from services.detector.map_store import MapStore
 from services.evaluate.bench import BenchOptions
 from services.evaluate.bench_peers import PeerCloud, Stem
+from services.evaluate.ring import fit_centre
 
 _NAN = float("nan")
 
@@ -28,6 +31,7 @@ SQUARE: tuple[Stem, ...] = tuple((x, y, _NAN) for x, y in (
 SQUARE_CUT: tuple[Stem, ...] = ((-0.05, 14.45, 0.3), (0.0, 17.15, 0.3))
 """Slivers of bark of stems that the border cuts."""
 FDS: tuple[Stem, ...] = ((-6.69, 6.49, _NAN), (-12.70, 7.04, _NAN), (-6.11, 14.29, _NAN), (-12.85, 12.41, _NAN))
+GROUNDLESS = ("TreeLS_square", "TLS_to_FDS_test_trunks")
 PINE_RADIUS_M = 0.253 / 2
 
 
@@ -42,7 +46,12 @@ def simulated_cloud(name: str, options: BenchOptions) -> PeerCloud:
 
     fair = [t for t in trees if t.fair and t.suitable]
     unfair = [t for t in trees if not (t.fair and t.suitable)]
-    return PeerCloud(name, mapper.cloud().points_m.astype(np.float64), _at_breast(fair), _at_breast(unfair))
+    store = MapStore()
+    for submap in mapper.whole_map():
+        if isinstance(submap, Submap):
+            store.take(submap)
+    points, views = store.assemble()
+    return PeerCloud(name, points.astype(np.float64), _at_breast(fair), views, ignored=_at_breast(unfair))
 
 
 def _at_breast(trees: Sequence[TrueTree]) -> tuple[Stem, ...]:
@@ -65,7 +74,9 @@ def real_clouds(folder: Path, tell: Callable[[str], None]) -> Iterator[PeerCloud
         points = read_cloud(file).points_m
         points = points if turn is None else points @ turn.T
         if name == "TreeLS_pine":
-            low = points[np.abs(points[:, 2] - points[:, 2].min() - 1.3) < 0.1]
-            middle = np.median(low[:, :2], axis=0)
-            stems = ((float(middle[0]), float(middle[1]), PINE_RADIUS_M),)
-        yield PeerCloud(name, points, tuple(stems), tuple(ignored))
+            low = points[np.abs(points[:, 2] - points[:, 2].min() - 1.3) < 0.1, :2]
+            middle = np.median(low, axis=0)
+            x, y = fit_centre(low - middle, PINE_RADIUS_M, 0.3)
+            stems = ((float(middle[0]) + x, float(middle[1]) + y, PINE_RADIUS_M),)
+        groundless = name in GROUNDLESS
+        yield PeerCloud(name, points, tuple(stems), groundless=groundless, ignored=tuple(ignored))

@@ -23,11 +23,11 @@ Rows = list[list[float]]
 
 _VERTICALITY: tuple[dict[str, float], ...] = (
     {},
-    {"n_points": 100},
+    {"n_points": 100, "resolution_xy": 0.04, "resolution_z": 0.04},
     {"scale": 0.25, "vert_threshold": 0.6, "n_points": 300},
-    {"scale": 0.25, "vert_threshold": 0.6, "n_points": 80},
+    {"scale": 0.25, "vert_threshold": 0.6, "n_points": 60, "resolution_xy": 0.05, "resolution_z": 0.05},
 )
-"""Settings of dendromatics' test of verticality: the defaults; fewer points, for thinned clouds; wider and laxer, which
+"""Settings of dendromatics' test of verticality: the defaults; fewer and wider apart, for thinned clouds; wider and laxer, which
 the noise of a camera's cloud needs. The first with which it finds anything counts."""
 
 

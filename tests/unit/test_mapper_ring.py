@@ -58,7 +58,7 @@ def test_too_few_points_are_no_ring() -> None:
 
 def test_peers_are_counted_once_and_the_unfair_are_neither_found_nor_false() -> None:
     nan = float("nan")
-    cloud = PeerCloud("c", np.zeros((1, 3)), ((0.0, 0.0, 0.1), (3.0, 0.0, nan)), ((5.0, 5.0, 0.3),))
+    cloud = PeerCloud("c", np.zeros((1, 3)), ((0.0, 0.0, 0.1), (3.0, 0.0, nan)), ignored=((5.0, 5.0, 0.3),))
     pairs, false = match(
         [(0.05, 0.0, 0.11), (0.1, 0.0, 0.12), (3.1, 0.0, 0.4), (5.2, 5.3, 0.2), (8.0, 0.0, 0.1)], cloud
     )
