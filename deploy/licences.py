@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import re
 import sys
-from importlib.metadata import PackageMetadata, PackageNotFoundError, metadata
+from importlib.metadata import PackageNotFoundError, metadata
 from pathlib import Path
+from typing import Any
 
 CONSTRAINTS = Path(__file__).resolve().parents[1] / "constraints.txt"
 _STRONG = re.compile(r"(?<![L])\b(A?GPL)", re.IGNORECASE)
@@ -20,8 +21,8 @@ TOLD_ELSEWHERE = {"open3d-cpu": "MIT"}
 """Packages whose metadata is silent, with what their own LICENSE file says."""
 
 
-def licence_of(package: PackageMetadata) -> str:
-    """Return the licence in the words of the package's metadata, empty when it tells none."""
+def licence_of(package: Any) -> str:  # noqa: ANN401 - the protocol lacks get, which every version has
+    """Return the licence in the words of the package's metadata (an email message), empty when it tells none."""
     expression = package.get("License-Expression")
     if expression:
         return str(expression).strip()
