@@ -1,38 +1,44 @@
 """From the camera's stamp to ``trees/target``: the real services as processes, joined by the bus, over a recording.
 
-A frame's stamp is when the camera was due to send it, on the machine's one clock; an observer notes when frame, pose
-and target of each stamp arrive. What lies between two arrivals is a stage; its parts come from the services' health.
+This process is the sensor: it holds the recording's raw images in memory, as a camera would deliver them, and hands them
+to the camera service at the rate asked for, stamped when it does. It also observes: it notes when frame, pose and target
+of each stamp arrive. What lies between two arrivals is a stage; its parts come from the services' health. Frames are
+dropped where a service is still busy, as from any camera.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import subprocess
 import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from schemas.camera import RgbdFrame
 from schemas.health import Health
 from schemas.slam import Pose
-from schemas.topics import CAMERA_RGBD, HEALTH, SLAM_POSE, TREES_TARGET
+from schemas.topics import CAMERA_RGBD, HEALTH, SIM_RGBD, SLAM_POSE, TREES_TARGET
 from schemas.trees import Target
 from services.common.config import TreedockConfig
 from services.common.errors import InputError
 from services.evaluate.bench import BenchOptions, BenchReport
 
+if TYPE_CHECKING:
+    from services.common.bus import Bus
+
 SCENE = "multi-04"
 RATES_HZ = (15.0, 30.0)
 _RECORDED_HZ = 15.0
-_FRAMES, _QUICK_FRAMES = 450, 90
-_CHAIN = ("slam", "mapper", "detector", "refiner")
+_FRAMES, _QUICK_FRAMES = 330, 90
+_SERVICES = ("camera", "slam", "mapper", "detector", "refiner")
 _READY_WITHIN_S = 240.0
 _DRAIN_S = 2.0
 _PARTS = {"slam": ("track",), "refiner": ("wait_for_pose", "refine"), "camera": ("frame",)}
@@ -55,7 +61,7 @@ class Passages:
     """What the observer saw, by stamp."""
 
     by_stamp: defaultdict[int, Passage] = field(default_factory=lambda: defaultdict(Passage))
-    health: dict[str, Health] = field(default_factory=dict)
+    sent: int = 0
     work_ms: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
     """Medians of the services' stages over each second."""
 
@@ -76,38 +82,37 @@ class Passages:
 
     def on_health(self, _: str, health: Health) -> None:
         """Note how a service is and how long its stages took in the last second."""
-        self.health[health.service] = health
         for stage in _PARTS.get(health.service, ()):
             if stage in health.work_ms:
                 self.work_ms[f"{health.service} {stage}"].append(health.work_ms[stage])
 
 
 def run(options: BenchOptions) -> BenchReport:
-    """Replay a simulated recording (or one of ``--scenes tum:DIR``) through the live system at 15 and at 30 Hz."""
+    """Send a simulated recording (or one of ``--scenes tum:DIR``) through the live system at 15 and at 30 Hz."""
     name = options.scenes[0] if options.scenes else SCENE
     if options.seed is not None and not options.scenes:
         name = f"random-multi-{options.seed}"
-    frames = _QUICK_FRAMES if options.quick else _FRAMES
+    wanted = _QUICK_FRAMES if options.quick else _FRAMES
     rates = RATES_HZ[:1] if options.quick else RATES_HZ
     figures: dict[str, float] = {}
     lines = [
-        "| rate | frames | answered | measured | p50 (ms) | p90 | p99 | max |",
-        "|---|---|---|---|---|---|---|---|",
+        "| rate | frames | answered | located | measured | p50 (ms) | p90 | p99 | max |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     stages: list[str] = []
-    with _recording(name, frames, options) as folder:
-        for rate in rates:
-            seen = measure(folder, rate / _RECORDED_HZ)
-            found = figures_of(seen)
-            first = rate == rates[0]
-            figures |= found if first else {f"{key}_{rate:.0f}hz": value for key, value in found.items()}
-            lines.append(_line(rate, found))
-            stages += [*_stage_lines(rate, seen), ""]
-            options.tell(lines[-1])
+    with _recording(name, wanted, options) as folder:
+        frames = read_frames(folder, wanted)
+    for rate in rates:
+        seen = measure(frames, rate)
+        found = figures_of(seen)
+        figures |= found if rate == rates[0] else {f"{key}_{rate:.0f}hz": value for key, value in found.items()}
+        lines.append(_line(rate, found))
+        stages += [*_stage_lines(rate, seen), ""]
+        options.tell(lines[-1])
     conditions = {
-        "recording": f"{name}, {frames} frames, JPEG and PNG files read by the camera service in its own process",
-        "processes": "router, camera, slam, mapper, detector, refiner and the observer, Zenoh over TCP on one machine",
-        "latency": "from the camera's stamp (when the frame was due) to the arrival of trees/target at the observer",
+        "recording": f"{name}, {len(frames)} raw frames of {frames[0].intrinsics.width}x{frames[0].intrinsics.height} from memory",
+        "processes": "router, camera, slam, mapper, detector, refiner, and this one; Zenoh on one machine",
+        "latency": "from the camera's stamp to the arrival of trees/target at an observer",
     }
     return BenchReport(figures, conditions, "\n".join([*lines, "", *stages]).rstrip())
 
@@ -128,23 +133,36 @@ def _recording(name: str, frames: int, options: BenchOptions) -> Iterator[Path]:
         yield Path(folder)
 
 
-def measure(recording: Path, speed: float) -> Passages:
-    """Run the system over a recording, replayed ``speed`` times as fast as recorded, and watch it.
+def read_frames(recording: Path, count: int) -> list[RgbdFrame]:
+    """Return the first good frames of a recording.
 
     Raises:
-        InputError: the recording cannot be used, or a service ended or was not ready in time.
+        InputError: there are none, or the recording cannot be used.
     """
-    from services.camera.sources import open_source
+    from services.camera.sources import open_recording
+
+    source = open_recording(recording, TreedockConfig().camera)
+    frames = list(itertools.islice((item for item in source if isinstance(item, RgbdFrame)), count))
+    if not frames:
+        raise InputError(f"{recording}: no usable frame")
+    return frames
+
+
+def measure(frames: Sequence[RgbdFrame], rate_hz: float) -> Passages:
+    """Run the system over raw frames at a rate, and watch it.
+
+    Raises:
+        InputError: a service ended, or was not ready in time.
+    """
     from services.common.bus import Bus
     from services.common.context import HealthBook
     from services.common.session import free_port, opened_client
 
     base = TreedockConfig()
     config = base.model_copy(update={
-        "camera": base.camera.model_copy(update={"source": f"tum:{recording.resolve()}", "rate": speed}),
+        "camera": base.camera.model_copy(update={"source": "sim"}),
         "router": base.router.model_copy(update={"port": free_port(base.router.host)}),
     })  # fmt: skip
-    open_source(config.camera.source, config.camera)  # finds its faults half a minute before the camera service would
     seen = Passages()
     with tempfile.TemporaryDirectory(prefix="treedock-latency-") as folder, _Processes(config, Path(folder)) as running:
         running.start("router")
@@ -154,18 +172,24 @@ def measure(recording: Path, speed: float) -> Passages:
             bus.subscribe_keys(SLAM_POSE, seen.on_pose, at_once=True)
             bus.subscribe_keys(TREES_TARGET, seen.on_target, at_once=True)
             bus.subscribe_keys(CAMERA_RGBD, seen.on_frame, at_once=True)
-            for name in _CHAIN:
+            for name in _SERVICES:
                 running.start(name)
-            _wait(running, lambda: all(bus.alive(name) for name in _CHAIN), _READY_WITHIN_S, "services to be ready")
-            running.start("camera")
-            _wait(running, lambda: _count(seen, "camera", "source_done") > 0, 3600.0, "the recording's end")
+            _wait(running, lambda: all(bus.alive(name) for name in _SERVICES), _READY_WITHIN_S, "services to be ready")
+            _send(bus, frames, rate_hz, running, seen)
             time.sleep(_DRAIN_S)
     return seen
 
 
-def _count(seen: Passages, service: str, name: str) -> int:
-    health = seen.health.get(service)
-    return health.counters.get(name, 0) if health else 0
+def _send(bus: Bus, frames: Sequence[RgbdFrame], rate_hz: float, running: _Processes, seen: Passages) -> None:
+    """Hand out the frames, each at its time."""
+    begin_s = time.monotonic()
+    for k, frame in enumerate(frames):
+        time.sleep(max(0.0, begin_s + k / rate_hz - time.monotonic()))
+        stamp_ns = time.time_ns()
+        bus.publish(SIM_RGBD, replace(frame, stamp_ns=stamp_ns, seq=k))
+        seen.sent += 1
+        if k % 15 == 0:
+            running.check()
 
 
 class _Processes:
@@ -227,7 +251,7 @@ def figures_of(seen: Passages) -> dict[str, float]:
         raise InputError("no frame was answered")
     p50, p90, p99 = np.quantile(ms, [0.5, 0.9, 0.99])
     return {
-        "frames": float(_count(seen, "camera", "frames")), "answered": float(len(ms)),
+        "frames": float(seen.sent), "answered": float(len(ms)),
         "located": float(sum(p.located for p in passages)), "measured": float(sum(p.measured for p in passages)),
         "latency_ms_p50": round(float(p50), 2), "latency_ms_p90": round(float(p90), 2),
         "latency_ms_p99": round(float(p99), 2), "latency_ms_max": round(float(ms.max()), 2),
@@ -236,7 +260,7 @@ def figures_of(seen: Passages) -> dict[str, float]:
 
 def _line(rate_hz: float, f: dict[str, float]) -> str:
     return (
-        f"| {rate_hz:.0f} Hz | {f['frames']:.0f} | {f['answered']:.0f} | {f['measured']:.0f} | {f['latency_ms_p50']:.1f} "
+        f"| {rate_hz:.0f} Hz | {f['frames']:.0f} | {f['answered']:.0f} | {f['located']:.0f} | {f['measured']:.0f} | {f['latency_ms_p50']:.1f} "
         f"| {f['latency_ms_p90']:.1f} | {f['latency_ms_p99']:.1f} | {f['latency_ms_max']:.1f} |"
     )
 
@@ -245,7 +269,7 @@ def stages_ms(seen: Passages) -> dict[str, list[float]]:
     """Return the stages of the frames that were seen at each: they add up to the latency."""
     whole = [(stamp, p) for stamp, p in seen.by_stamp.items() if p.frame_ns and p.pose_ns and p.target_ns]
     return {
-        "camera: due, read, published, on the bus": [(p.frame_ns - stamp) * 1e-6 for stamp, p in whole],
+        "camera: to the service, conditioned, on the bus": [(p.frame_ns - stamp) * 1e-6 for stamp, p in whole],
         "to slam and back, without tracking": [(p.pose_ns - p.frame_ns) * 1e-6 - p.track_ms for _, p in whole],
         "slam: tracking": [p.track_ms for _, p in whole],
         "refiner: pose to target": [(p.target_ns - p.pose_ns) * 1e-6 for _, p in whole],
