@@ -19,6 +19,7 @@ from schemas.slam import Pose
 from schemas.topics import CAMERA_COMPRESSED, HEALTH, SLAM_POSE, TOPICS, TREES_LIST, VEHICLE_STATE
 from services.camera.codecs import decode_depth_raw, encode_colour, encode_depth
 from services.camera.config import CameraConfig
+from services.camera.depth.config import DepthConfig
 from services.camera.sources import open_recording
 from services.cli.app import invoke
 from services.common.config import TreedockConfig
@@ -90,7 +91,8 @@ def test_messages_come_out_as_they_went_in(tmp_path: Path) -> None:
 
 def test_process_and_run_read_the_frames_with_their_depth_untouched(tmp_path: Path) -> None:
     path = recorded(tmp_path)
-    frames = [f for f in open_recording(path, CameraConfig(min_range_m=0.1)) if isinstance(f, RgbdFrame)]
+    settings = CameraConfig(min_range_m=0.1, depth=DepthConfig(drop_mixed=False))
+    frames = [f for f in open_recording(path, settings) if isinstance(f, RgbdFrame)]
     assert len(frames) == 12
     np.testing.assert_array_equal(decode_depth_raw(frames[3]), decode_depth_raw(frame(3)))
 
