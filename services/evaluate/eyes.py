@@ -58,4 +58,4 @@ def see(
     R = rotation_z(believed_yaw_rad - true_yaw_rad)
     free = np.where(blind, 0.0, np.clip(hit - 0.1, 0.0, TRUSTED_M))
     fan = Fan(azimuth + believed_yaw_rad - true_yaw_rad, free)
-    return View(stamp_ns, points @ R.T, fan, believed_m.copy(), map_key)
+    return View(stamp_ns, points @ R.T, fan, believed_m.copy(), map_key=map_key)

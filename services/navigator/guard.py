@@ -26,6 +26,8 @@ _SEEING_SHARE = 0.05
 _HITS = 3
 """So many rays in three neighbouring columns make a surface."""
 _SURFACE_M = 0.10
+_BESIDE, _EDGE_SHARE = 3, 0.06
+"""Pixels to either side, and the share of the depth by which they may differ on one surface."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +47,9 @@ class View:
     fan: Fan | None = None
     position_m: Matrix = field(default_factory=lambda: np.zeros(3))
     """Where the camera was (3,), in the map of ``map_key``."""
+    solid: NDArray[np.bool_] | None = None
+    """Which of the points (N,) lie on a surface, not on the edge of one: a stereo camera strews points behind edges.
+    None: all of them. The sweep takes all, what is remembered takes the solid ones."""
     map_key: tuple[str, int] | None = None
     """Map and reset counter of the pose used; None where no pose was known: then it is good for the sweep only."""
 
@@ -71,7 +76,19 @@ def look(
     points = rays * thin[..., None]
     seen = thin > 0.0
     fan = fan_of(rays, points, seen)
-    return View(stamp_ns, points[seen], fan, T_map_camera[:3, 3].copy(), map_key)
+    return View(stamp_ns, points[seen], fan, T_map_camera[:3, 3].copy(), _solid(depth)[seen], map_key)
+
+
+def _solid(depth: NDArray[np.uint16]) -> NDArray[np.bool_]:
+    """Return for each thinned ray whether the pixels beside it are at about its depth."""
+    rows = depth[_THIN // 2 :: _THIN].astype(np.float32)
+    middle = rows[:, _THIN // 2 :: _THIN]
+    left, right = rows[:, _THIN // 2 - _BESIDE :: _THIN], rows[:, _THIN // 2 + _BESIDE :: _THIN]
+    width = middle.shape[1]
+    out = np.ones(middle.shape, dtype=bool)
+    for beside in (left[:, :width], right[:, :width]):
+        out &= np.abs(beside - middle) < _EDGE_SHARE * middle
+    return out
 
 
 def fan_of(rays: Matrix, points: Matrix, seen: NDArray[np.bool_]) -> Fan:

@@ -77,7 +77,7 @@ class Space:
         at = view.position_m[:2]
         if view.fan is not None:
             self._look_along(at, view.fan.azimuth_rad, view.fan.free_m)
-        p = view.points_m
+        p = view.points_m if view.solid is None else view.points_m[view.solid]
         near = (np.abs(p[:, 2]) < BAND_M) & (np.hypot(p[:, 0], p[:, 1]) < _NOTED_M)
         places = p[near][:, :2] + at
         for d in known:

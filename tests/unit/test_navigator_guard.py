@@ -77,6 +77,18 @@ def test_the_fan_is_free_up_to_what_stands_and_a_blinded_camera_sees_nothing() -
     assert (fan.free_m[39:49] == 0.0).all()
 
 
+def test_points_strewn_behind_an_edge_are_seen_but_not_remembered() -> None:
+    depth = np.full((480, 640), 4000, dtype=np.uint16)
+    depth[:, 300:340] = 2000
+    depth[:, 296:300] = depth[:, 340:344] = 2900  # mixed of trunk and background
+    view = look(depth, INTRINSICS, level_camera((0.0, 0.0, 1.5), 0.0), 0, ("m", 0))
+    assert view.solid is not None
+    ahead = view.points_m[:, 0]
+    assert (np.abs(ahead - 2.9) < 0.05).any()
+    assert not (np.abs(ahead[view.solid] - 2.9) < 0.05).any()
+    assert (np.abs(ahead[view.solid] - 2.0) < 0.05).sum() > 0.5 * (np.abs(ahead - 2.0) < 0.05).sum()
+
+
 # -- space --------------------------------------------------------------------------------------------------------
 
 
