@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,21 @@ _SIZE = 420
 _ABOVE_M = 0.6
 """Half the width of the view from above, at least."""
 _SIDE_M = 1.6
+_UP_M = (-0.2, 3.0)
 _SLICE_M = (0.3, 2.2)
 _INK, _GOOD, _BAD, _GROUND = (60, 60, 60), (40, 140, 40), (40, 40, 200), (150, 190, 220)
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    name: str
+    base_m: Floats
+    """(3,) upright frame."""
+    slope: Floats
+    """(2,): dx/dz, dy/dz; zero where the lean is not known."""
+    radius_m: float
+    lines: tuple[str, str]
+    good: bool
 
 
 def draw_candidates(folder: Path, points_m: NDArray[np.floating], result: DetectionResult) -> list[Path]:
@@ -33,33 +47,33 @@ def draw_candidates(folder: Path, points_m: NDArray[np.floating], result: Detect
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"--pictures {folder}: cannot be written: {error.strerror}") from error
-    for name, base, radius, lines, good in _candidates(frame, result):
-        path = folder / name
-        if not cv2.imwrite(str(path), _picture(frame, result, base, radius, lines, good=good)):
-            raise InputError(f"--pictures {folder}: {name} cannot be written")
+    for candidate in _candidates(frame, result):
+        path = folder / candidate.name
+        if not cv2.imwrite(str(path), _picture(frame, result, candidate)):
+            raise InputError(f"--pictures {folder}: {candidate.name} cannot be written")
         paths.append(path)
     return paths
 
 
-def _candidates(frame: Upright, result: DetectionResult) -> list[tuple[str, Floats, float, tuple[str, str], bool]]:
-    """Return file name, place in the upright frame, radius and words of each."""
-    out: list[tuple[str, Floats, float, tuple[str, str], bool]] = []
+def _candidates(frame: Upright, result: DetectionResult) -> list[_Candidate]:
+    out: list[_Candidate] = []
     for k, t in enumerate(result.trunks, start=1):
         words = f"r {100 * t.radius_m:.1f} cm, arc {np.degrees(t.arc_rad):.0f} deg, confidence {t.confidence:.2f}"
+        axis = frame.R @ np.array(t.axis)
         place = frame.from_input(np.array(t.base_m))
-        out.append((f"kept-{k:03d}.png", place, t.radius_m, (words, t.remark or "suitable"), True))
+        lines = (words, t.remark or "suitable")
+        out.append(_Candidate(f"kept-{k:03d}.png", place, axis[:2] / axis[2], t.radius_m, lines, good=True))
     for k, r in enumerate(result.rejections, start=1):
         place = frame.from_input(np.array([r.x_m, r.y_m, r.z_m]))
-        words = f"r {100 * r.radius_m:.1f} cm, {r.layers} slices"
-        out.append((f"dropped-{k:03d}.png", place, r.radius_m, (words, r.reason), False))
+        lines = (f"r {100 * r.radius_m:.1f} cm, {r.layers} slices", r.reason)
+        out.append(_Candidate(f"dropped-{k:03d}.png", place, np.zeros(2), r.radius_m, lines, good=False))
     return out
 
 
-def _picture(
-    frame: Upright, result: DetectionResult, base: Floats, radius: float, lines: tuple[str, str], *, good: bool
-) -> NDArray[np.uint8]:
+def _picture(frame: Upright, result: DetectionResult, candidate: _Candidate) -> NDArray[np.uint8]:
     import cv2
 
+    base, radius = candidate.base_m, candidate.radius_m
     near = np.hypot(frame.xyz_m[:, 0] - base[0], frame.xyz_m[:, 1] - base[1]) < _SIDE_M
     p = frame.xyz_m[near].astype(np.float64)
     p = p[:: max(1, len(p) // 60_000)]
@@ -67,31 +81,25 @@ def _picture(
     d = p[:, :2] - base[:2]
     wide = max(_ABOVE_M, 2.5 * radius)
     slab = (height > _SLICE_M[0]) & (height < _SLICE_M[1])
-    above = _panel(d[slab], (-wide, wide), (-wide, wide), np.zeros(np.count_nonzero(slab)))
-    scale = _SIZE / (2.0 * wide)
-    colour = _GOOD if good else _BAD
-    cv2.circle(above, (_SIZE // 2, _SIZE // 2), max(1, round(radius * scale)), colour, 1, cv2.LINE_AA)
-    side = _panel(
-        np.column_stack([d[:, 0], height]), (-_SIDE_M, _SIDE_M), (-0.2, 3.0), (np.abs(height) < 0.1).astype(float)
-    )
+    straight = d[slab] - height[slab, None] * candidate.slope  # a leaning trunk is seen along its axis
+    above = _panel(straight, (-wide, wide), (-wide, wide), np.zeros(len(straight)))
+    colour = _GOOD if candidate.good else _BAD
+    cv2.circle(above, (_SIZE // 2, _SIZE // 2), max(1, round(radius * _SIZE / (2.0 * wide))), colour, 1, cv2.LINE_AA)
+    side = _panel(np.column_stack([d[:, 0], height]), (-_SIDE_M, _SIDE_M), _UP_M, (np.abs(height) < 0.1).astype(float))
     for edge in (-radius, radius):
-        u = round((edge + _SIDE_M) / (2.0 * _SIDE_M) * _SIZE)
-        cv2.line(
-            side, (u, round(_SIZE * (1.0 - 2.4 / 3.2))), (u, round(_SIZE * (1.0 - 0.5 / 3.2))), colour, 1, cv2.LINE_AA
-        )
+        foot, head = (_pixel(edge + float(candidate.slope[0]) * h, h) for h in _SLICE_M)
+        cv2.line(side, foot, head, colour, 1, cv2.LINE_AA)
     words = np.full((46, 2 * _SIZE, 3), 255, dtype=np.uint8)
-    for row, text in enumerate(lines):
-        cv2.putText(
-            words,
-            text,
-            (6, 17 + 20 * row),
-            cv2.FONT_HERSHEY_SIMPLEX,
-            0.45,
-            _INK if row == 0 else colour,
-            1,
-            cv2.LINE_AA,
-        )
+    for row, text in enumerate(candidate.lines):
+        ink = _INK if row == 0 else colour
+        cv2.putText(words, text, (6, 17 + 20 * row), cv2.FONT_HERSHEY_SIMPLEX, 0.45, ink, 1, cv2.LINE_AA)
     return np.vstack([words, np.hstack([above, side])])
+
+
+def _pixel(across_m: float, height_m: float) -> tuple[int, int]:
+    """Return the pixel of a place in the view from the side."""
+    u = (across_m + _SIDE_M) / (2.0 * _SIDE_M) * _SIZE
+    return round(u), round((_UP_M[1] - height_m) / (_UP_M[1] - _UP_M[0]) * _SIZE)
 
 
 def _panel(
