@@ -165,9 +165,11 @@ def _decoding_table(counts: bytes, symbols: bytes) -> Ints:
 
 def _scan(array: Bytes, position: int, body: bytes, header: _Header) -> tuple[str, int]:
     """Return (fault or nothing, position of the marker behind the scan)."""
-    if header.frame not in _SEQUENTIAL:
-        return "", _skip_scan(array, position)
     names = [(body[1 + 2 * k], body[2 + 2 * k]) for k in range(body[0])]
+    wanted = {table for _, ids in names for table in (ids >> 4, 0x10 | (ids & 15))}
+    # motion JPEG leaves the usual tables out, and a height of zero is told after the scan: decoders know, we only skip
+    if header.frame not in _SEQUENTIAL or not wanted <= header.tables.keys() or header.height == 0:
+        return "", _skip_scan(array, position)
     h_max = max(h for h, _ in header.sampling.values())
     v_max = max(v for _, v in header.sampling.values())
     tables, blocks, steps = [], [], []

@@ -85,6 +85,17 @@ def test_a_whole_jpeg_is_accepted(flavour: str, shape: tuple[int, ...]) -> None:
         assert jpeg_fault(bytes(cv2.imencode(".jpg", image, options)[1])) == ""
 
 
+def test_motion_jpeg_without_its_tables_is_accepted() -> None:
+    data = encode_colour(colour_image(5), "jpeg")
+    while (at := data.find(b"\xff\xc4")) >= 0:
+        length = int.from_bytes(data[at + 2 : at + 4], "big")
+        data = data[:at] + data[at + 2 + length :]
+    assert jpeg_fault(data) == ""
+    assert np.array_equal(
+        decode_colour_image(data, 48, 32), decode_colour_image(encode_colour(colour_image(5), "jpeg"), 48, 32)
+    )
+
+
 def _large_jpeg(options: list[int]) -> bytes:
     rng = np.random.default_rng(2)
     image = cv2.resize(rng.integers(0, 255, (60, 80, 3), dtype=np.uint8), (640, 480), interpolation=cv2.INTER_CUBIC)
