@@ -71,7 +71,7 @@ function fillTree(item, { t, kind, far }, page) {
   text(mark, t.id);
   set(mark, "data-kind", kind);
   text(middle.firstChild, `⌀ ${(t.radius * 200).toFixed(1)} cm`);
-  text(middle.lastChild, `${KIND_WORDS[kind]} · ± ${(t.sigma * 100).toFixed(0)} cm · ${Math.round(t.confidence * 100)} %`);
+  text(middle.lastChild, `${KIND_WORDS[kind]} · ± ${(t.sigma * 100).toFixed(t.sigma < 0.0095 ? 1 : 0)} cm · ${Math.round(t.confidence * 100)} %`);
   text(distance, `${far.toFixed(1)} m`);
   const open = page.selected === t.id;
   set(row, "aria-expanded", open);
