@@ -13,7 +13,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from services.cli.run import services_for
+from services.cli.run_plan import services_for
 from services.common.config import TreedockConfig
 from services.inventory.store import default_path, open_store
 from services.station.launch import address_in, announce, station_services, with_station
