@@ -199,7 +199,7 @@ def plot_motions(rows: Sequence[MotionRow], path: Path) -> str:
 
 
 def _plot_error(panel: Any, row: MotionRow, k: int, scale: float) -> None:  # noqa: ANN401 - matplotlib
-    """Draw raw and filtered less true, the filter's own two sigma about zero, and the map's word where it is in reach."""
+    """Draw raw and filtered less true, the filter's own two sigma about zero, and the map's word."""
     sigma, mapped = 2.0 * scale * row.sigma[:, k], scale * (row.mapped[:, k] - row.true[:, k])
     raw, filtered = (scale * (values[:, k] - row.true[:, k]) for values in (row.raw, row.filtered))
     panel.fill_between(row.t_s, -sigma, sigma, color="tab:blue", alpha=0.12, linewidth=0, label="2 sigma as told")
@@ -207,5 +207,5 @@ def _plot_error(panel: Any, row: MotionRow, k: int, scale: float) -> None:  # no
     panel.plot(row.t_s, raw, ".", color="tab:red", markersize=3, label="raw")
     panel.plot(row.t_s, filtered, color="tab:blue", linewidth=1.0, label="filtered")
     panel.axhline(0.0, color="black", linewidth=0.5)
-    reach = 1.3 * float(np.nanmax([np.nanmax(np.abs(raw)), np.nanmax(sigma)]))
+    reach = 1.15 * float(np.nanmax(np.abs(np.concatenate([raw, sigma, mapped]))))
     panel.set_ylim(-reach, reach)

@@ -52,6 +52,15 @@ def test_wrong_intrinsics_are_told_and_their_targets_not_believed(wrong: dict[st
     assert "calibrate" in states[-1].note
 
 
+def test_another_camera_begins_with_a_clean_slate() -> None:
+    tracker, states = _pan(TRUE.model_copy(update={"fx": 300.0, "fy": 300.0}))
+    assert not states[-1].measured
+    T = camera_at()
+    state = tracker.step(FRAMES * PERIOD_NS, sensed(render([CONE], T, TRUE), 1), TRUE, T, np.eye(6) * 1e-5)
+    assert state.measured
+    assert tracker.camera_fault == ""
+
+
 def _fed(
     slope: float, seed: int, *, side: float = 0.0, jump_m: float = 0.0, interrupt: bool = False, sweep: float = 0.9
 ) -> str:

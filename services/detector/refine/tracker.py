@@ -55,6 +55,7 @@ class RefinerTracker:
         self._recent: deque[tuple[int, Matrix]] = deque(maxlen=8)
         self._agreement = ColourAgreement(config.agreement)
         self._consistency = MapConsistency(config.consistency)
+        self._intrinsics: Intrinsics | None = None
 
     @property
     def camera_fault(self) -> str:
@@ -96,6 +97,7 @@ class RefinerTracker:
         self._trees, self._suitable, self._corrections = {}, set(), {}
         self._map_id, self._chosen, self._pose = map_id, None, None
         self._recent.clear()
+        self._consistency.interrupt()
         self._forget_target()
 
     def pose_jumped(self) -> None:
@@ -132,6 +134,7 @@ class RefinerTracker:
             colour: (H, W, 3) of the frame, where it is at hand: depth that shows another moment is then noticed.
         """
         known_pose = T_map_camera is not None
+        self._know_camera(intrinsics)
         T, covariance = self._usable_pose(stamp_ns, T_map_camera, pose_covariance)
         if T is None:
             self._forget_target()
@@ -182,6 +185,15 @@ class RefinerTracker:
             self._filter, self._place_map_m = None, None
             return None
         return tree
+
+    def _know_camera(self, intrinsics: Intrinsics) -> None:
+        """Forget what was found about another camera."""
+        if intrinsics is self._intrinsics:
+            return
+        if self._intrinsics is not None and intrinsics != self._intrinsics:
+            self._agreement = ColourAgreement(self._config.agreement)
+            self._consistency = MapConsistency(self._config.consistency)
+        self._intrinsics = intrinsics
 
     def _doubt(
         self, measured: Measurement, target: ExpectedTree, T: Matrix | None, stamp_ns: int, intrinsics: Intrinsics,
