@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -13,7 +15,7 @@ from rich.console import Console
 from schemas.navigation import MissionState
 from services.cli import run as run_module
 from services.cli import scratch
-from services.cli.mission import Flown, prepared
+from services.cli.mission import Conductor, Flown, prepared
 from services.cli.run import Run
 from services.cli.run_plan import services_for, with_trees
 from services.common.config import TreedockConfig
@@ -112,3 +114,36 @@ def test_handheld_guides_and_flies_nothing(source: str) -> None:
     if source == "sim":
         assert made.simulator.mode == "scan"
         assert made.simulator.path.hold_s >= made.navigator.dock.window_s + 3.0
+
+
+class _Watch:
+    """What the conductor looks at, all switches."""
+
+    def __init__(self) -> None:
+        self.bus = self
+        self.pose = SimpleNamespace(status="tracking")
+        self.clock = None
+        self.source_ended = False
+
+    def subscribe(self, topic: object, handler: object) -> None:
+        del topic, handler
+
+    def ask(self, *_: object, **__: object) -> list[object]:
+        return []
+
+
+def test_handheld_starts_without_a_vehicle_and_ends_with_the_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("services.cli.mission._ASK_AGAIN_S", 0.0)
+    accepted = SimpleNamespace(accepted=True, reason="")
+    monkeypatch.setattr("services.navigator.client.send_command", lambda *_, **__: accepted)
+    watch: Any = _Watch()
+    person, pilot = Conductor(watch, 60.0, handheld=True), Conductor(watch, 60.0)
+    assert not person.update(ready=True)
+    assert not pilot.update(ready=True)
+    assert person._started
+    assert not pilot._started, "nobody flies without a vehicle"
+    watch.source_ended = True
+    assert person.update(ready=True)
+    late = Conductor(watch, 60.0, handheld=True)
+    assert late.update(ready=False)
+    assert "ended before" in late.word
