@@ -177,6 +177,10 @@ class Detector:
         """Return the FAST corners (N, 2) of a level, and adapt its threshold to their number."""
         found = self._fast[level].detect(small)
         threshold = self._threshold[level]
+        if len(found) < self._quota[level] and threshold > self._lowest:  # a sudden want of texture does not wait
+            threshold = self._lowest
+            self._fast[level].setThreshold(threshold)
+            found = self._fast[level].detect(small)
         if len(found) < _SPARSE * self._quota[level]:
             threshold = max(threshold - 3, self._lowest)
         elif len(found) > _CROWDED * self._quota[level]:

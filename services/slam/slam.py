@@ -25,10 +25,12 @@ from services.slam.keyframing import KeyframeRule
 from services.slam.links import shared_counts
 from services.slam.loops import Loops
 from services.slam.mapping import Mapping
+from services.slam.motion import Motion, can_have_moved
 from services.slam.places import Places
 from services.slam.results import GraphUpdate, NewKeyframe, TrackResult, map_covariance
 from services.slam.tracking import Tracked, Tracking, moved
 from services.slam.trail import Trail
+from services.slam.verify import Verifier
 from services.slam.worker import Crew, Inline
 
 F64 = NDArray[np.float64]
@@ -68,8 +70,10 @@ class Slam:
         self._felt: tuple[int, F64 | None, F64 | None] | None = None
         """Stamp, specific force and the autopilot's up of the last frame, when it was located."""
         self._last: Tracked | None = None
-        self._step = np.eye(4)
-        """T_camera_lastcamera of the last two tracked frames: the constant velocity."""
+        self._motion = Motion()
+        self._verifier = Verifier(intrinsics, camera)
+        self._found: tuple[int, Tracked] | None = None
+        """Stamp and frame of a place found blind that waits for a second frame to say the same."""
         self._reference = -1
         self._anchor: F64 = np.eye(4)
         """T_keyframe_camera of the last tracked frame."""
@@ -107,9 +111,9 @@ class Slam:
                 return self._initialise(stamp_ns, features, accel_camera, attitude_up_camera)
             graph = self._catch_up()
             graph = self._level_map() or graph
-            frame = self._locate(features)
+            frame = self._locate(stamp_ns, features, depth_m)
             if frame is None and self.config.relocalise:
-                frame = self._relocalise(features)
+                frame = self._relocalise(stamp_ns, features, depth_m)
                 graph = self._catch_up() or graph
             if frame is None:
                 return self._lost(stamp_ns, graph)
@@ -150,12 +154,12 @@ class Slam:
         self.graph_version += 1
         return self._graph(reason)
 
-    def _locate(self, features: Features) -> Tracked | None:
+    def _locate(self, stamp_ns: int, features: Features, depth_m: NDArray[np.float32]) -> Tracked | None:
         """Return the frame located in the map, or None."""
         last = self._last
         if last is None:
             return None
-        predicted = self._step @ pose(last.R, last.t)
+        predicted = inverse(self._motion.predict(stamp_ns)) @ pose(last.R, last.t)
         R = orthonormal(predicted[:3, :3])
         frame = self.tracking.follow(last, features, np.ascontiguousarray(R), predicted[:3, 3].copy())
         if frame is None:
@@ -163,7 +167,8 @@ class Slam:
         joined = self.tracking.join_map(frame)
         if joined is None or joined[0].inliers < self.config.min_inliers:
             return None
-        return joined[0]
+        believed = self._motion.plausible(stamp_ns, _step(last, joined[0]))
+        return joined[0] if believed and self._verifier.believes(joined[0], depth_m, blind=False) else None
 
     def _level_map(self) -> GraphUpdate | None:
         """Turn the map upright when gravity is known better by the last frame; return the new graph."""
@@ -187,16 +192,25 @@ class Slam:
         """Return the doubt of the map's vertical, standard deviation."""
         return self._upright.sigma_rad
 
-    def _relocalise(self, features: Features) -> Tracked | None:
-        """Return the frame located anywhere in the map; that is a jump, and told as one."""
+    def _relocalise(self, stamp_ns: int, features: Features, depth_m: NDArray[np.float32]) -> Tracked | None:
+        """Return the frame located anywhere in the map; that is a jump, and told as one.
+
+        When in doubt it is not believed before a second frame was found where the camera can be by then.
+        """
         frame = self.loops.relocate(features)
-        if frame is not None:
-            if self._taken_up:
-                self._taken_up, self.mapping.why = False, "restored"
-                self.mapping.revision += 1
-            self._last = None
-            self._step = np.eye(4)
-            self._count_reset()
+        if frame is None or not self._verifier.believes(frame, depth_m, blind=True):
+            self._found = None
+            return None
+        before, self._found = self._found, (stamp_ns, frame)
+        again = before is not None and can_have_moved((stamp_ns - before[0]) * 1e-9, _step(before[1], frame))
+        if not again and not self._verifier.sure(frame):
+            return None
+        self._found = None
+        if self._taken_up:
+            self._taken_up, self.mapping.why = False, "restored"
+            self.mapping.revision += 1
+        self._last = None
+        self._count_reset()
         return frame
 
     def _count_reset(self) -> None:
@@ -204,8 +218,7 @@ class Slam:
 
     def _accept(self, stamp_ns: int, frame: Tracked, graph: GraphUpdate | None) -> TrackResult:
         """Remember a frame that has its pose, and make a keyframe of it when the map needs one."""
-        if self._last is not None:
-            self._step = pose(frame.R, frame.t) @ inverse(pose(self._last.R, self._last.t))
+        self._motion.update(stamp_ns, None if self._last is None else _step(self._last, frame))
         new: list[NewKeyframe] = []
         if self.graph_version == 0 or self._rule.wants(frame, self.crew.waiting):
             new, graph = self._make_keyframe(frame, graph)
@@ -275,7 +288,6 @@ class Slam:
             return self._catch_up()
 
     def _lost(self, stamp_ns: int, graph: GraphUpdate | None) -> TrackResult:
-        self._step = np.eye(4)
         return self._result(stamp_ns, "relocalising" if self._taken_up else "lost", None, [], graph)
 
     def _graph(self, reason: GraphReason) -> GraphUpdate:
@@ -311,3 +323,8 @@ class Slam:
     def final_trajectory(self) -> list[tuple[int, F64]]:
         """Return (stamp_ns, T_map_camera) of each tracked frame, placed by what is now known of its keyframe."""
         return [] if self._trail is None else self._trail.placed(self.mapping.keyframe_pose)
+
+
+def _step(last: Tracked, frame: Tracked) -> F64:
+    """Return T_last_camera (4, 4) of two located frames."""
+    return pose(last.R, last.t) @ inverse(pose(frame.R, frame.t))

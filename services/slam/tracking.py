@@ -47,6 +47,10 @@ class Tracked:
     information: F64 | None = None
     """(6, 6) of the pose, order (v, w), left perturbation of camera from map."""
     chi2: float = 0.0
+    place: F64 | None = None
+    """(M, 3) u, v, disparity of the local map's points with measured depth that should be seen besides those matched before."""
+    expected: int = 0
+    """Points of the local map that should be seen, with those that are."""
 
 
 class Tracking:
@@ -213,7 +217,9 @@ class Tracking:
         if count < 6:
             return None
         point[index[~use]] = -1
-        return Tracked(f, R, t, point, count, H, chi2)
+        seen = ~np.isnan(place[:, 0])
+        expected = int(np.count_nonzero(seen)) + int(np.count_nonzero(frame.point >= 0))
+        return Tracked(f, R, t, point, count, H, chi2, place[seen & (p.parallax[ids] < 0.0)], expected)
 
     def _local_keyframes(self, counts: I32) -> I32:
         atlas = self.atlas
