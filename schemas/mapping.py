@@ -132,17 +132,17 @@ class MapIndex(Message):
     """
 
     SCHEMA: ClassVar[str] = "treedock.map_index"
-    MAX_BYTES: ClassVar[int] = 1024 * 1024
+    MAX_BYTES: ClassVar[int] = 8 * 1024 * 1024
 
     stamp_ns: StampNs
     map_id: Name
     epoch: Counter
     """Names this run of the mapper: versions of another run say nothing about the points of this one."""
     graph_version: Counter
-    submap_ids: Annotated[tuple[Counter, ...], Field(max_length=20_000)]
-    versions: Annotated[tuple[Counter, ...], Field(max_length=20_000)]
+    submap_ids: Annotated[tuple[Counter, ...], Field(max_length=200_000)]
+    versions: Annotated[tuple[Counter, ...], Field(max_length=200_000)]
     """Of each submap's points."""
-    placed_by: Annotated[tuple[Counter, ...], Field(max_length=20_000)]
+    placed_by: Annotated[tuple[Counter, ...], Field(max_length=200_000)]
     """Version of the graph under which each submap was last sent: an older place is out of date."""
     ground_sequence: Counter = 0
     """Of the last ``map/ground``."""

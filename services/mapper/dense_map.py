@@ -149,7 +149,7 @@ class DenseMap:
             if self._differs(submap.T_map_submap, new):
                 submap.T_map_submap = new
                 moved.append(submap)
-        thinned = self._rekey([s for s in moved if _shift_m(s.T_keyed, s.T_map_submap) > self._config.rekey_m])
+        thinned = self._rekey([s for s in moved if shift_m(s.T_keyed, s.T_map_submap) > self._config.rekey_m])
         ids = {s.submap_id for s in thinned}
         return Moves([s for s in moved if s.submap_id not in ids], thinned)
 
@@ -235,7 +235,7 @@ def _alike(a: Matrix, b: Matrix) -> bool:
     return float(a[:3, 2] @ b[:3, 2]) > _ALIKE_COSINE and float(np.abs(a[:3, 3] - b[:3, 3]).max()) < _ALIKE_M
 
 
-def _shift_m(a: Matrix, b: Matrix) -> float:
+def shift_m(a: Matrix, b: Matrix) -> float:
     """Return about how far a submap's points went between two of its poses."""
     turn = float(np.linalg.norm(log_rotation(a[:3, :3].T @ b[:3, :3])))
     return float(np.linalg.norm(a[:3, 3] - b[:3, 3])) + _ARM_M * turn

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from services.mapper.dense_map import MapSubmap
+from services.mapper.dense_map import MapSubmap, shift_m
 from services.mapper.ground_kernels import (
     BINS,
     STRAYS,
@@ -29,6 +29,7 @@ _LEAST = 30
 """Points that make a cell."""
 _FEW_LEFT = 3
 """A submap's far points, seen by chance, need not be followed: cells with fewer of its points are not touched by it."""
+_MOVE_M = 0.01
 _HEIGHT_M, _SLOPE, _RELIEF_M = 0.005, 0.01, 0.005
 """Smaller changes are not told."""
 
@@ -69,6 +70,8 @@ class _Footprint:
     """(n, 2)."""
     low: NDArray[np.int64]
     high: NDArray[np.int64]
+    T_map_submap: Floats
+    points: int
 
 
 class GroundModel:
@@ -95,9 +98,16 @@ class GroundModel:
         self.cells, self._prints, self._dirty = {}, {}, []
 
     def touch(self, submaps: Iterable[MapSubmap]) -> None:
-        """Note that these submaps are new, moved or have lost points: where they were and where they are is to be redone."""
+        """Note that these submaps are new, moved or have lost points: where they were and where they are is to be redone.
+
+        A centimetre is not worth it: local corrections move a dozen submaps with each keyframe.
+        """
         for submap in submaps:
-            old = self._prints.pop(submap.submap_id, None)
+            old = self._prints.get(submap.submap_id)
+            same = old is not None and old.points == len(submap.points_m)
+            if same and old is not None and shift_m(old.T_map_submap, submap.T_map_submap) < _MOVE_M:
+                continue
+            self._prints.pop(submap.submap_id, None)
             if old is not None:
                 self._dirty.append(old.cells)
             if len(submap.points_m) == 0:
@@ -146,7 +156,7 @@ class GroundModel:
         keys, counts = np.unique((at[:, 0] << 32) + (at[:, 1] + (1 << 31)), return_counts=True)
         keys = keys[counts >= min(_FEW_LEFT, int(counts.max()))]
         cells = np.stack([keys >> 32, (keys & 0xFFFFFFFF) - (1 << 31)], axis=1)
-        return _Footprint(cells, cells.min(axis=0), cells.max(axis=0))
+        return _Footprint(cells, cells.min(axis=0), cells.max(axis=0), T, len(submap.points_m))
 
     def _fit(self, submaps: list[MapSubmap], low: NDArray[np.int64], size: NDArray[np.int64]) -> Floats:
         shape, cell = (int(size[0]), int(size[1])), self.cell_m

@@ -45,16 +45,17 @@ class GroundPatches:
     def _patches(
         self, cells: dict[CellIndex, GroundPlane], gone: Iterable[CellIndex], when: Occasion, first: int
     ) -> list[GroundPatch]:
-        items = sorted(cells.items())
-        parts = [items[i : i + _PER_MESSAGE] for i in range(0, max(1, len(items)), _PER_MESSAGE)]
+        items, lost = sorted(cells.items()), sorted(gone)
+        starts = range(0, max(1, len(items), len(lost)), _PER_MESSAGE)
+        parts = [(items[i : i + _PER_MESSAGE], lost[i : i + _PER_MESSAGE]) for i in starts]
         whole = first == self.sequence
         return [
             GroundPatch(
                 stamp_ns=when.stamp_ns, map_id=when.map_id, graph_version=when.graph_version,
                 sequence=first if whole else first + number, cell_m=self.model.cell_m,
-                gone=tuple(gone) if number == 0 else (), cells=tuple(_message(at, plane) for at, plane in part),
+                gone=tuple(left), cells=tuple(_message(at, plane) for at, plane in part),
             )
-            for number, part in enumerate(parts)
+            for number, (part, left) in enumerate(parts)
         ]  # fmt: skip
 
 
