@@ -57,7 +57,7 @@ def ground_plane(points_m: Floats, up: Floats, trials: int = 300) -> tuple[Float
     """Return (unit normal, offset) of the plane with most points among those within 35 degrees of level (RANSAC)."""
     rng = np.random.default_rng(1)
     height = points_m @ up
-    low = points_m[height < np.percentile(height, 60.0)]
+    low = points_m[height <= np.percentile(height, 60.0)]  # on a flat cloud all of them
     sample = low[:: max(1, len(low) // 20_000)]
     best, best_on = (up, float(np.percentile(height, 2.0))), 0
     for _ in range(trials):

@@ -66,3 +66,12 @@ def test_clusters_and_density() -> None:
     assert sorted(len(c) for c in euclidean_clusters(two, 0.05)) == [100, 100]
     assert len(euclidean_clusters(two, 0.2)) == 1
     assert density_m(np.hstack([g, np.zeros((100, 1))])) == pytest.approx(0.01)
+
+
+@pytest.mark.parametrize("method", [detect_reference, detect_cylinders])
+@pytest.mark.parametrize("count", [1, 3, 40])
+@pytest.mark.parametrize("spread", [0.0, 1.0])
+def test_baselines_take_clouds_without_anything(method: object, count: int, spread: float) -> None:
+    assert callable(method)
+    flat = np.random.default_rng(1).uniform(0.0, 5.0, (count, 3)) * [1.0, 1.0, 0.0]
+    assert method(spread * flat, UP).trunks == ()
