@@ -19,6 +19,7 @@ import numpy as np
 from services.detector.refine.config import ConsistencyConfig
 from services.detector.refine.model import Matrix
 
+_JUDGE_EVERY = 5
 _CORRELATED = 5.0
 """Residuals of so many neighbouring frames are one."""
 
@@ -91,7 +92,8 @@ class MapConsistency:
             self._passes.append(last)
             self._broken = False
         last.add(stamp_ns, bearing_rad, range_m / float(np.hypot(*(last.mapped_m - camera_m))) - 1.0)
-        self._judge()
+        if last.frames % _JUDGE_EVERY == 0:
+            self._judge()
 
     def _useful(self, one: Pass) -> bool:
         config = self._config
