@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import signal
 import sqlite3
-import subprocess
-import sys
 import tempfile
 import time
-import urllib.request
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import psutil
@@ -23,98 +17,15 @@ from schemas.topics import HEALTH
 from services.common.bus import Bus
 from services.common.context import HealthBook
 from services.common.errors import GoalNotReachedError
-from services.common.session import free_port, opened_client
+from services.common.session import opened_client
 from services.evaluate.bench import BenchOptions, BenchReport
+from services.evaluate.station_ground import Ground, Page
 from services.evaluate.station_load import Load
 
 _AIRCRAFT, _RATE_HZ, _TREES = 10, 5.0, 500
 _MEASURE_S, _QUICK_S = 20.0, 8.0
 _KILLS, _QUICK_KILLS = 100, 5
 _MOST_LOST_S = 1.0
-
-
-class Ground:
-    """Router and station as processes of their own, in a folder."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.port, self.page_port = free_port(), free_port()
-        self.processes: dict[str, subprocess.Popen[bytes]] = {}
-
-    @property
-    def endpoint(self) -> str:
-        """The router's address."""
-        return f"tcp/127.0.0.1:{self.port}"
-
-    @property
-    def address(self) -> str:
-        """The page's address."""
-        return f"http://127.0.0.1:{self.page_port}/"
-
-    @property
-    def database(self) -> Path:
-        """The inventory's file."""
-        return self.folder / "inventory.gpkg"
-
-    def start(self, name: str) -> None:
-        """Start the router or the station."""
-        more = [] if name == "router" else ["--page-port", str(self.page_port), "--set",
-                                            f"station.inventory.database={self.database}"]  # fmt: skip
-        command = [sys.executable, "-m", "services.cli.app", name, "--port", str(self.port), *more]
-        with (self.folder / f"{name}.log").open("ab") as log:
-            self.processes[name] = subprocess.Popen(command, stdout=log, stderr=log)
-
-    def kill(self, name: str, number: int = signal.SIGKILL) -> None:
-        """End one of them."""
-        process = self.processes.pop(name)
-        process.send_signal(number)
-        process.wait(10.0)
-
-    def served(self) -> bool:
-        """Whether the page answers."""
-        with suppress(OSError), urllib.request.urlopen(self.address, timeout=0.5) as answer:
-            return bool(answer.status == 200)
-        return False
-
-    def close(self) -> None:
-        """End both."""
-        for name in list(self.processes):
-            self.kill(name)
-
-
-class Page:
-    """A page without a browser: its WebSocket, and what it was told."""
-
-    def __init__(self, ground: Ground) -> None:
-        from websockets.sync.client import connect
-        from websockets.typing import Origin
-
-        address, origin = ground.address.replace("http", "ws") + "ws", Origin(ground.address.rstrip("/"))
-        self._socket = connect(address, origin=origin, max_size=None, legacy=True)
-        self._socket.send(json.dumps({"t": "hello", "secret": "b" * 24, "name": "bench"}))
-        self.trees: dict[str, int] = {}
-        self.links: dict[str, str] = {}
-
-    def hear(self, timeout_s: float) -> None:
-        """Take one frame."""
-        frame = self._socket.recv(timeout=timeout_s)
-        body: dict[str, Any] = json.loads(frame) if isinstance(frame, str) else {"t": ""}
-        if body["t"] == "trees":
-            self.trees[body["uav"]] = len(body["rows"])
-        elif body["t"] == "state":
-            self.links = {view["uav"]: view["link"] for view in body["aircraft"]}
-
-    def right(self, aircraft: int, trees: int) -> bool:
-        """Whether it shows all aircraft with good links and all their trees."""
-        return (
-            len(self.links) == aircraft
-            and set(self.links.values()) == {"good"}
-            and list(self.trees.values()) == [trees] * aircraft
-        )
-
-    def close(self) -> None:
-        """Close it."""
-        self._socket.close()
 
 
 def run(options: BenchOptions) -> BenchReport:

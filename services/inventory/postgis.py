@@ -26,8 +26,8 @@ _LOCK = 0x74726565
 class PostGis:
     """One open inventory database."""
 
-    def __init__(self, url: str) -> None:
-        """Connect and make the tables where they are missing.
+    def __init__(self, url: str, *, read_only: bool = False) -> None:
+        """Connect and, unless ``read_only``, make the tables where they are missing.
 
         Raises:
             InputError: no driver, no server, no PostGIS there, or another station at work.
@@ -42,7 +42,8 @@ class PostGis:
         self.path = url.rpartition("@")[2]  # the part without a password, for messages
         try:
             self._db: Any = psycopg.connect(url, row_factory=dict_row, connect_timeout=5)
-            self._create()
+            if not read_only:
+                self._create()
         except psycopg.Error as error:
             raise InputError(f"inventory {self.path}: {' '.join(str(error).split())}") from error
         self.failure: type[Exception] = psycopg.Error

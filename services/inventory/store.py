@@ -46,7 +46,7 @@ def open_store(database: str, *, read_only: bool = False) -> Store:
     if database.startswith(("postgresql://", "postgres://")):
         from services.inventory.postgis import PostGis
 
-        return PostGis(database)
+        return PostGis(database, read_only=read_only)
     path = Path(database).expanduser() if database else default_path()
     if read_only:
         if not path.is_file():

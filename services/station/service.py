@@ -41,21 +41,17 @@ from schemas.trees import TreeList
 from services.common.bus import Bus
 from services.common.health import HealthReporter
 from services.common.runtime import LiveContext
-from services.inventory.export import csv_bytes, geojson_bytes, tree_rows
-from services.inventory.keeper import Keeper, Tone
-from services.inventory.store import open_store
-from services.inventory.values import AuditLine
 from services.navigator.client import send_command
 from services.station.aircraft import Aircraft
 from services.station.brain import Brain, Outgoing
 from services.station.cloud import CloudView
-from services.station.events import Event
 from services.station.guard import Guard
+from services.station.keeping import Keeping
 from services.station.launch import open_browser
 from services.station.preview import frame_of
 from services.station.requests import Request
 from services.station.server import WebServer, bound_socket
-from services.station.web import Download, Site
+from services.station.web import Site
 
 LOG = logging.getLogger(__name__)
 
@@ -80,12 +76,14 @@ class Station:
         self._strangers: set[str] = set()
         self._reporter = HealthReporter("station", context.health)
         self._pool = ThreadPoolExecutor(_ORDERS_AT_ONCE, thread_name_prefix="order")
-        self.keeper = self._keeper()
         token = self._token()
-        self.site = Site(self.config, Guard(token, local=self.config.local), _Ears(self), self._downloads())
+        self.site = Site(self.config, Guard(token, local=self.config.local), _Ears(self))
         self.brain = Brain(self.config, self.site, self._send_order, time.time_ns)
         self.brain.on_cloud_wish = self._on_cloud_wish
         self._clouds: dict[str, CloudView] = {}
+        self.keeping = Keeping(self.config.inventory, self.brain.log, context.health, self.call)
+        self.site.downloads = self.keeping.downloads()
+        self._told = context.inbox.mailbox(lambda call: call(), _REQUEST_RING)
         self._server = WebServer(self.site, self.config, self._bound())
         self.address = self._address(token)
 
@@ -108,44 +106,6 @@ class Station:
         if self.config.open_browser:
             open_browser(self.address)
 
-    # -- the inventory
-
-    def _keeper(self) -> Keeper | None:
-        """Open the inventory; without one (``none``) the station keeps nothing."""
-        config = self.config.inventory
-        if config.database == "none":
-            return None
-        return Keeper(open_store(config.database), config, self._on_inventory)
-
-    def _on_inventory(self, text: str, tone: Tone) -> None:
-        self.call(lambda: self._tell_inventory(text, tone))
-
-    def _tell_inventory(self, text: str, tone: Tone) -> None:
-        self.brain.log.add("", "inventory", tone, text)
-        if tone != "info":
-            self._context.health.note("inventory", text if tone == "bad" else "")
-
-    def _audit(self, event: Event) -> None:
-        assert self.keeper is not None
-        self.keeper.audit(AuditLine(event.time_ns, event.uav, event.kind, event.level, event.who, event.text))
-
-    def _downloads(self) -> dict[str, Download]:
-        if self.keeper is None:
-            return {}
-        database = self.config.inventory.database
-
-        def rows() -> list[dict[str, Any]]:
-            store = open_store(database, read_only=True)
-            try:
-                return tree_rows(*(store.rows(name) for name in ("trees", "trees_local", "sites")))
-            finally:
-                store.close()
-
-        return {
-            "trees.csv": lambda: (csv_bytes(rows()), "text/csv; charset=utf-8"),
-            "trees.geojson": lambda: (geojson_bytes(rows()), "application/geo+json"),
-        }
-
     def _address(self, token: str) -> str:
         scheme = "https" if self.config.tls_certificate else "http"
         host = f"[{self.config.host}]" if ":" in self.config.host else self.config.host
@@ -154,7 +114,6 @@ class Station:
     def register(self) -> None:
         """Connect to the bus and open the page."""
         c = self._context
-        self._told = c.inbox.mailbox(lambda call: call(), _REQUEST_RING)
         tokens = c.inbox.mailbox(self._on_token, _TOKEN_RING)
         direct: zenoh.handlers.Callback[zenoh.Sample]
         direct = zenoh.handlers.Callback(lambda sample: c.inbox.put(tokens, sample), indirect=False)
@@ -163,9 +122,7 @@ class Station:
         c.every_wall(1.0 / self.config.page_hz, lambda: self.brain.tell_state(time.monotonic()))
         c.every_wall(1.0, self._each_second)
         c.on_stop(self._stop)
-        if self.keeper is not None:
-            self.brain.log.listeners.append(self._audit)
-            self.keeper.start()
+        self.keeping.start()
         self._server.start()
         self._tell_address()
 
@@ -221,22 +178,13 @@ class Station:
             and before is not None
             and now.visited_tree_ids != before.visited_tree_ids
         ):
-            self._keep(aircraft)
+            self.keeping.trees(aircraft)
 
     def _on_trees(self, aircraft: Aircraft, message: TreeList) -> None:
         aircraft.links.note(TREES_LIST, TREES_LIST.name, time.monotonic(), None)
         self._context.health.count("messages")
         if aircraft.on_trees(message):
-            self._keep(aircraft)
-
-    def _keep(self, aircraft: Aircraft) -> None:
-        """Offer the newest list to the inventory, with the trees docked at in the same map."""
-        mission, trees = aircraft.mission, aircraft.trees
-        if self.keeper is not None and trees is not None:
-            same = mission is not None and mission.map_id == trees.map_id
-            visited = mission.visited_tree_ids if mission is not None and same else ()
-            in_air = aircraft.map_begun_in_air and aircraft.trail_map == trees.map_id
-            self.keeper.offer(aircraft.uav, trees, frozenset(visited), in_air=in_air)
+            self.keeping.trees(aircraft)
 
     def _on_preview(self, aircraft: Aircraft, message: PreviewImage) -> None:
         aircraft.links.note(PREVIEW_IMAGE, PREVIEW_IMAGE.name, time.monotonic(), None)
@@ -306,8 +254,7 @@ class Station:
         self._context.health.counters["slow_pages"] = self.site.cut_off
 
     def _stop(self) -> None:
-        if self.keeper is not None:
-            self.keeper.close()
+        self.keeping.close()
         self._server.stop()
         self._pool.shutdown(wait=False, cancel_futures=True)
 

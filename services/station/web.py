@@ -65,11 +65,12 @@ class Ears(Protocol):
 class Site:
     """The application and its open pages. ``latest``, ``each`` and ``one`` may be called from any thread."""
 
-    def __init__(self, config: StationConfig, guard: Guard, ears: Ears, downloads: dict[str, Download]) -> None:
+    def __init__(self, config: StationConfig, guard: Guard, ears: Ears) -> None:
         self._config = config
         self._guard = guard
         self._ears = ears
-        self._downloads = downloads
+        self.downloads: dict[str, Download] = {}
+        """Exports by file name."""
         self._files = dict(_read(files("services.station") / "static", ""))
         self._pages: dict[int, tuple[Outbox, asyncio.Event]] = {}
         self._numbers = itertools.count(1)
@@ -135,7 +136,7 @@ class Site:
 
     async def _download(self, request: Request) -> Response:
         name = request.path_params["name"]
-        make = self._downloads.get(name)
+        make = self.downloads.get(name)
         if make is None:
             return PlainTextResponse("there is no such export", status_code=404)
         body, kind = await run_in_threadpool(make)
