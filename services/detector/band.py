@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from services.detector.ground import GroundedCloud
-from services.detector.ground_kernels import height_above
+from services.detector.ground_surface import height_above
 from services.detector.halves import both_halves, half_of
 from services.detector.model import Floats
 from services.detector.upright import Upright

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.detector import ground_kernels as kernels
+from services.detector import ground_surface as surface
 from services.detector.halves import both_halves, half_of
 from services.detector.model import Ground
 from services.detector.upright import Upright
@@ -56,7 +57,7 @@ def find_ground(frame: Upright, cell_m: float) -> GroundedCloud:
     lowest = Ground(x0, y0, cell, planes, seen=True, note="ground seen")
     bins, low, mid = _surface(frame, cell_of, lowest)
     if low > 1.5 * mid and low >= 50:
-        kernels.settle(bins, planes)
+        surface.settle(bins, planes)
         return GroundedCloud(lowest, cell_of)
     return GroundedCloud(_without_ground(frame, lowest), cell_of)
 
@@ -83,17 +84,17 @@ def _surface(frame: Upright, cell_of: Ints32, ground: Ground) -> tuple[Ints32, i
     nx, ny, _ = ground.planes.shape
     n = len(cell_of)
     step = max(1, n // max(_SAMPLE, _SAMPLE_PER_CELL * nx * ny))
-    bins = np.zeros((2, nx, ny, kernels.BINS), dtype=np.int32)
+    bins = np.zeros((2, nx, ny, surface.BINS), dtype=np.int32)
     hits = np.zeros((2, nx * 5, ny * 5), dtype=np.uint8)
 
     def work(half: int) -> None:
         begin, end = half_of(n, half)
-        kernels.near_surface(
+        surface.near_surface(
             frame.xyz_m, cell_of, begin, end, step, ground.x0_m, ground.y0_m, ground.cell_m, ground.planes, bins[half], hits[half]
         )  # fmt: skip
 
     both_halves(work, n // step)
-    low, mid = kernels.count_patches(hits[0], hits[1])
+    low, mid = surface.count_patches(hits[0], hits[1])
     bins[0] += bins[1]
     return bins[0], int(low), int(mid)
 
