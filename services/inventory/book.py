@@ -8,12 +8,11 @@ once the pattern of their trees says how one lies on the other; until then each 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 from schemas.trees import Tree, TreeList
-from services.inventory.align import Alignment, Prior, align
 from services.inventory.config import InventoryConfig, StartPoint
 from services.inventory.geodesy import TangentPlane, place_of_start
+from services.inventory.joining import Joiner
 from services.inventory.merge import Spots, assign, fuse
 from services.inventory.values import (
     Belief,
@@ -28,9 +27,6 @@ from services.inventory.values import (
 )
 
 _RAN_BACK_NS = 5_000_000_000
-_PRIOR_SIGMAS = 3.0
-_NEWS_SHARE = 1.05
-"""A flight is laid on a site again when both have grown by so much since it was tried last."""
 _WRITE_MOVE_M = 0.002
 _WRITE_RADIUS_M = 0.0005
 _WRITE_SIGMAS = 0.5
@@ -48,21 +44,25 @@ class Inventory:
         self.flights = {flight.fid: flight for flight in contents.flights}
         self.trees = {tree.fid: tree for tree in contents.trees}
         self.sightings = {sighting.fid: sighting for sighting in contents.sightings}
-        self._of_flight: dict[int, dict[int, Sighting]] = {fid: {} for fid in self.flights}
-        self._of_tree: dict[int, dict[int, Sighting]] = {fid: {} for fid in self.trees}
+        self.of_flight: dict[int, dict[int, Sighting]] = {fid: {} for fid in self.flights}
+        self.of_tree: dict[int, dict[int, Sighting]] = {fid: {} for fid in self.trees}
         for sighting in self.sightings.values():
-            self._of_flight[sighting.flight][sighting.tree_id] = sighting
-            self._of_tree.setdefault(sighting.tree, {})[sighting.fid] = sighting
+            self.of_flight[sighting.flight][sighting.tree_id] = sighting
+            self.of_tree.setdefault(sighting.tree, {})[sighting.fid] = sighting
         self._next_tree = max(self.trees, default=0) + 1
         self._next_sighting = max(self.sightings, default=0) + 1
         self._fine_ns: dict[int, int] = {}
-        self._tried: dict[tuple[int, int], int] = {}
+        self._joiner = Joiner(self, config)
         self.changes = Changes()
 
     def written(self) -> Changes:
         """Return what must be written and begin anew."""
         changes, self.changes = self.changes, Changes()
         return changes
+
+    def join_next(self, now_ns: int) -> bool:
+        """Try to lay one flight on one site; see ``Joiner``."""
+        return self._joiner.join_next(now_ns)
 
     # -- flights
 
@@ -83,7 +83,7 @@ class Inventory:
             return flight
         flight.stamp_ns, flight.version, flight.last_ns = trees.stamp_ns, trees.version, now_ns
         self.changes.flights[flight.fid] = flight
-        seen = self._of_flight[flight.fid]
+        seen = self.of_flight[flight.fid]
         fresh = [tree for tree in trees.trees if tree.id not in seen]
         self._link_new(flight, fresh, now_ns)
         touched = self._update(flight, trees, now_ns)
@@ -94,7 +94,7 @@ class Inventory:
                 tree.visited = True
                 touched.add(tree.fid)
         for fid in sorted(touched):
-            self._refresh(fid, now_ns)
+            self.refresh(fid, now_ns)
         return flight
 
     def _flight(self, uav: str, trees: TreeList, now_ns: int, *, in_air: bool) -> Flight:
@@ -107,7 +107,7 @@ class Inventory:
         run = 1 if newest is None else newest.run + 1
         flight = self._new_flight(fid, uav, trees.map_id, run, now_ns, in_air=in_air)
         self.flights[fid] = self.changes.flights[fid] = flight
-        self._of_flight[fid] = {}
+        self.of_flight[fid] = {}
         return flight
 
     def _new_flight(self, fid: int, uav: str, map_id: str, run: int, now_ns: int, *, in_air: bool) -> Flight:
@@ -142,7 +142,7 @@ class Inventory:
         partners: list[int | None] = [None] * len(fresh)
         if flight.aligned or self._precise(flight):
             candidates = self._others(flight)
-            found = assign(self._placed(flight, beliefs), self._known(candidates), self._config)
+            found = assign(self.placed(flight, beliefs), self.known(candidates), self._config)
             partners = [candidates[k].fid if k >= 0 else None for k in found]
         for tree, belief, partner in zip(fresh, beliefs, partners, strict=True):
             fid = partner if partner is not None else self._new_tree(flight, now_ns)
@@ -150,8 +150,8 @@ class Inventory:
             self._next_sighting += 1
             sighting = Sighting(number, flight.fid, tree.id, fid, belief)
             self.sightings[number] = self.changes.sightings[number] = sighting
-            self._of_flight[flight.fid][tree.id] = sighting
-            self._of_tree.setdefault(fid, {})[number] = sighting
+            self.of_flight[flight.fid][tree.id] = sighting
+            self.of_tree.setdefault(fid, {})[number] = sighting
 
     def _precise(self, flight: Flight) -> bool:
         """Whether the start point alone is good enough to tell trunks apart, at 10 m from it."""
@@ -160,16 +160,18 @@ class Inventory:
 
     def _others(self, flight: Flight) -> list[InventoryTree]:
         """Return the site's trees that the flight has no part in yet."""
-        own = {sighting.tree for sighting in self._of_flight[flight.fid].values()}
+        own = {sighting.tree for sighting in self.of_flight[flight.fid].values()}
         return [t for t in self.trees.values() if t.site == flight.site and t.status != "merged" and t.fid not in own]
 
-    def _placed(self, flight: Flight, beliefs: list[Belief]) -> Spots:
+    def placed(self, flight: Flight, beliefs: list[Belief]) -> Spots:
+        """Return beliefs in the frame of the flight's site."""
         at = [flight.place.apply(b.x_m, b.y_m, b.z_m) for b in beliefs]
         return Spots.of([(x, y, b.radius_m, b.sigma_xy_m, b.sigma_radius_m)
                          for (x, y, _), b in zip(at, beliefs, strict=True)])  # fmt: skip
 
     @staticmethod
-    def _known(trees: list[InventoryTree]) -> Spots:
+    def known(trees: list[InventoryTree]) -> Spots:
+        """Return trees of the inventory as arrays."""
         return Spots.of([(t.x_m, t.y_m, t.radius_m, t.sigma_xy_m, t.sigma_radius_m) for t in trees])
 
     def _new_tree(self, flight: Flight, now_ns: int) -> int:
@@ -179,13 +181,13 @@ class Inventory:
             fid, flight.frame, flight.site, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, suitable=False,
             status="present", merged_into=None, first_ns=now_ns, last_ns=now_ns,
         )  # fmt: skip
-        self._of_tree[fid] = {}
+        self.of_tree[fid] = {}
         return fid
 
     def _update(self, flight: Flight, trees: TreeList, now_ns: int) -> set[int]:
         """Take the new beliefs and keep those worth keeping in the history; return the trees they touch."""
         touched: set[int] = set()
-        seen = self._of_flight[flight.fid]
+        seen = self.of_flight[flight.fid]
         fine = now_ns - self._fine_ns.get(flight.fid, 0) >= _FINE_EVERY_NS
         if fine:
             self._fine_ns[flight.fid] = now_ns
@@ -234,18 +236,18 @@ class Inventory:
     def _withdraw(self, flight: Flight, trees: TreeList, touched: set[int]) -> None:
         """Mark what the list no longer holds; a tree that no flight's list holds any more stays, as withdrawn."""
         listed = {tree.id for tree in trees.trees}
-        for tree_id, sighting in self._of_flight[flight.fid].items():
+        for tree_id, sighting in self.of_flight[flight.fid].items():
             if sighting.present and tree_id not in listed:
                 sighting.present = False
                 self.changes.sightings[sighting.fid] = sighting
                 touched.add(sighting.tree)
 
-    def _refresh(self, fid: int, now_ns: int) -> None:
+    def refresh(self, fid: int, now_ns: int) -> None:
         """Compute a tree anew from its flights' beliefs."""
         tree = self.trees[fid]
         if tree.status == "merged":
             return
-        parts = list(self._of_tree[fid].values())
+        parts = list(self.of_tree[fid].values())
         present = [s for s in parts if s.present]
         tree.status = "present" if present else "withdrawn"
         used = present or parts
@@ -259,94 +261,6 @@ class Inventory:
         tree.flights = len({s.flight for s in used})
         tree.last_ns = now_ns
         self.changes.trees[fid] = tree
-
-    # -- joining flights
-
-    def join_next(self, now_ns: int) -> bool:
-        """Try to lay one flight on one site (its own; without a start point any other local one); 10 to 20 ms.
-
-        Returns:
-            Whether there was anything to try: call again until there is not, but not all at once.
-        """
-        trees: dict[int, list[InventoryTree]] = {}
-        for tree in self.trees.values():
-            if tree.status == "present":
-                trees.setdefault(tree.site, []).append(tree)
-        for flight in self.flights.values():
-            if flight.aligned:
-                continue
-            sightings = [s for s in self._of_flight[flight.fid].values() if s.present]
-            for site in self._sites_to_try(flight):
-                own = {s.tree for s in sightings} if site == flight.site else set()
-                known = [t for t in trees.get(site, ()) if t.fid not in own]
-                least, size = self._config.align_min_trees, len(sightings) + len(known)
-                enough = len(sightings) >= least and len(known) >= least
-                if enough and size > _NEWS_SHARE * self._tried.get((flight.fid, site), 0):
-                    self._tried[flight.fid, site] = size
-                    self._try(flight, sightings, site, known, now_ns)
-                    return True
-        return False
-
-    def _try(
-        self, flight: Flight, sightings: list[Sighting], site: int, known: list[InventoryTree], now_ns: int
-    ) -> None:
-        prior = None
-        if flight.frame == "global":
-            turn_rad, shift_m = max(flight.sigma_heading_rad, 0.01), max(flight.sigma_m, 0.1)
-            prior = Prior(_PRIOR_SIGMAS * turn_rad * math.sqrt(2.0), _PRIOR_SIGMAS * shift_m * math.sqrt(2.0))
-        found = align(self._placed(flight, [s.belief for s in sightings]), self._known(known), self._config, prior)
-        if found is not None:
-            self._join(flight, site, found, now_ns)
-
-    def _sites_to_try(self, flight: Flight) -> list[int]:
-        if flight.frame == "global":
-            return [flight.site]
-        occupied = {f.site for f in self.flights.values() if f.fid != flight.fid}
-        # the older one stays where it is, but whatever lies on the globe stays there
-        return sorted(s for s in occupied if s != flight.site and (s < flight.site or self.sites[s].frame == "global"))
-
-    def _join(self, flight: Flight, site: int, found: Alignment, now_ns: int) -> None:
-        """Move the flight into the site by what was found, and its trees onto the trees there."""
-        place = flight.place
-        x, y, _ = Rigid2(found.theta_rad, *found.shift_m).apply(place.x_m, place.y_m, 0.0)
-        flight.place = replace(place, theta_rad=place.theta_rad + found.theta_rad, x_m=x, y_m=y)
-        flight.site, flight.frame, flight.aligned = site, self.sites[site].frame, True
-        flight.sigma_m, flight.sigma_heading_rad = max(found.rms_m, 0.02), 0.01
-        where = "" if flight.frame == "global" else "; local coordinates"
-        flight.note = f"laid on the inventory by {found.agreeing} trees, {found.rms_m:.2f} m{where}"
-        self.changes.flights[flight.fid] = flight
-        sightings = list(self._of_flight[flight.fid].values())
-        alone = [s for s in sightings if len(self._of_tree[s.tree]) == 1]
-        self._move_trees(flight, alone)
-        own = {s.tree for s in sightings}
-        others = [t for t in self.trees.values() if t.site == site and t.status != "merged" and t.fid not in own]
-        partner = assign(self._placed(flight, [s.belief for s in alone]), self._known(others), self._config)
-        for sighting, k in zip(alone, partner, strict=True):
-            if k >= 0:
-                self._relink(sighting, others[int(k)].fid)
-        for fid in sorted({s.tree for s in sightings}):
-            self._refresh(fid, now_ns)
-
-    def _move_trees(self, flight: Flight, sightings: list[Sighting]) -> None:
-        for sighting in sightings:
-            tree = self.trees[sighting.tree]
-            if tree.frame == "local" and flight.frame == "global":
-                self.changes.placed.append(tree.fid)
-            tree.site, tree.frame = flight.site, flight.frame
-            self.changes.trees[tree.fid] = tree
-
-    def _relink(self, sighting: Sighting, to: int) -> None:
-        """Make a sighting one of another tree; the tree it leaves stays as merged, so that no number is lost."""
-        left = self.trees[sighting.tree]
-        left.status, left.merged_into = "merged", to
-        self.changes.trees[left.fid] = left
-        if left.visited:
-            self.trees[to].visited = True
-        self.trees[to].first_ns = min(self.trees[to].first_ns, left.first_ns)
-        del self._of_tree[left.fid][sighting.fid]
-        self._of_tree[to][sighting.fid] = sighting
-        sighting.tree = to
-        self.changes.sightings[sighting.fid] = sighting
 
 
 def belief_of(t: Tree) -> Belief:

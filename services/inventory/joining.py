@@ -1,0 +1,118 @@
+"""Join flights that saw the same trees: one attempt at a time, between commits. Pure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from services.inventory.align import Alignment, Prior, align
+from services.inventory.config import InventoryConfig
+from services.inventory.merge import assign
+from services.inventory.values import Flight, InventoryTree, Rigid2, Sighting
+
+if TYPE_CHECKING:
+    from services.inventory.book import Inventory
+
+_PRIOR_SIGMAS = 3.0
+_NEWS_SHARE = 1.05
+"""A flight is laid on a site again when both have grown by so much since it was tried last."""
+
+
+class Joiner:
+    """Lays the flights of an inventory on each other."""
+
+    def __init__(self, book: Inventory, config: InventoryConfig) -> None:
+        self._book = book
+        self._config = config
+        self._tried: dict[tuple[int, int], int] = {}
+
+    def join_next(self, now_ns: int) -> bool:
+        """Try to lay one flight on one site (its own; without a start point any other local one); 10 to 20 ms.
+
+        Returns:
+            Whether there was anything to try: call again until there is not, but not all at once.
+        """
+        trees: dict[int, list[InventoryTree]] = {}
+        for tree in self._book.trees.values():
+            if tree.status == "present":
+                trees.setdefault(tree.site, []).append(tree)
+        for flight in self._book.flights.values():
+            if flight.aligned:
+                continue
+            sightings = [s for s in self._book.of_flight[flight.fid].values() if s.present]
+            for site in self._sites_to_try(flight):
+                own = {s.tree for s in sightings} if site == flight.site else set()
+                known = [t for t in trees.get(site, ()) if t.fid not in own]
+                least, size = self._config.align_min_trees, len(sightings) + len(known)
+                enough = len(sightings) >= least and len(known) >= least
+                if enough and size > _NEWS_SHARE * self._tried.get((flight.fid, site), 0):
+                    self._tried[flight.fid, site] = size
+                    self._try(flight, sightings, site, known, now_ns)
+                    return True
+        return False
+
+    def _try(
+        self, flight: Flight, sightings: list[Sighting], site: int, known: list[InventoryTree], now_ns: int
+    ) -> None:
+        prior = None
+        if flight.frame == "global":
+            turn_rad, shift_m = max(flight.sigma_heading_rad, 0.01), max(flight.sigma_m, 0.1)
+            prior = Prior(_PRIOR_SIGMAS * turn_rad * math.sqrt(2.0), _PRIOR_SIGMAS * shift_m * math.sqrt(2.0))
+        found = align(
+            self._book.placed(flight, [s.belief for s in sightings]), self._book.known(known), self._config, prior
+        )
+        if found is not None:
+            self._join(flight, site, found, now_ns)
+
+    def _sites_to_try(self, flight: Flight) -> list[int]:
+        if flight.frame == "global":
+            return [flight.site]
+        occupied = {f.site for f in self._book.flights.values() if f.fid != flight.fid}
+        # the older one stays where it is, but whatever lies on the globe stays there
+        return sorted(
+            s for s in occupied if s != flight.site and (s < flight.site or self._book.sites[s].frame == "global")
+        )
+
+    def _join(self, flight: Flight, site: int, found: Alignment, now_ns: int) -> None:
+        """Move the flight into the site by what was found, and its trees onto the trees there."""
+        place = flight.place
+        x, y, _ = Rigid2(found.theta_rad, *found.shift_m).apply(place.x_m, place.y_m, 0.0)
+        flight.place = replace(place, theta_rad=place.theta_rad + found.theta_rad, x_m=x, y_m=y)
+        flight.site, flight.frame, flight.aligned = site, self._book.sites[site].frame, True
+        flight.sigma_m, flight.sigma_heading_rad = max(found.rms_m, 0.02), 0.01
+        where = "" if flight.frame == "global" else "; local coordinates"
+        flight.note = f"laid on the inventory by {found.agreeing} trees, {found.rms_m:.2f} m{where}"
+        self._book.changes.flights[flight.fid] = flight
+        sightings = list(self._book.of_flight[flight.fid].values())
+        alone = [s for s in sightings if len(self._book.of_tree[s.tree]) == 1]
+        self._move_trees(flight, alone)
+        own = {s.tree for s in sightings}
+        others = [t for t in self._book.trees.values() if t.site == site and t.status != "merged" and t.fid not in own]
+        partner = assign(self._book.placed(flight, [s.belief for s in alone]), self._book.known(others), self._config)
+        for sighting, k in zip(alone, partner, strict=True):
+            if k >= 0:
+                self._relink(sighting, others[int(k)].fid)
+        for fid in sorted({s.tree for s in sightings}):
+            self._book.refresh(fid, now_ns)
+
+    def _move_trees(self, flight: Flight, sightings: list[Sighting]) -> None:
+        for sighting in sightings:
+            tree = self._book.trees[sighting.tree]
+            if tree.frame == "local" and flight.frame == "global":
+                self._book.changes.placed.append(tree.fid)
+            tree.site, tree.frame = flight.site, flight.frame
+            self._book.changes.trees[tree.fid] = tree
+
+    def _relink(self, sighting: Sighting, to: int) -> None:
+        """Make a sighting one of another tree; the tree it leaves stays as merged, so that no number is lost."""
+        left = self._book.trees[sighting.tree]
+        left.status, left.merged_into = "merged", to
+        self._book.changes.trees[left.fid] = left
+        if left.visited:
+            self._book.trees[to].visited = True
+        self._book.trees[to].first_ns = min(self._book.trees[to].first_ns, left.first_ns)
+        del self._book.of_tree[left.fid][sighting.fid]
+        self._book.of_tree[to][sighting.fid] = sighting
+        sighting.tree = to
+        self._book.changes.sightings[sighting.fid] = sighting
