@@ -86,14 +86,14 @@ def _report(whole: Live, paced: Live, frames: int, seed: int) -> BenchReport:
         f"| with decoding and publishing, CPU of the thread | {cpu[0]:.1f} | {cpu[1]:.1f} |",
         f"| tracking, wall, frames at {RATE_HZ:g} Hz | {real[0]:.1f} | {real[1]:.1f} |",
         "",
-        f"All {frames} frames one after another: {whole.lost} lost, {whole.keyframes} keyframes made, {whole.alive[-1]} of them in "
+        f"{len(whole.track_ms)} of {frames} frames one after another: {whole.lost} lost, {whole.keyframes} keyframes made, {whole.alive[-1]} of them in "
         f"the map at the end, {whole.loops} loops, {whole.rss_mb:.0f} MB at most; position error {whole.error_m[-1]:.2f} m at the end, "
         f"{max(whole.error_m):.2f} m at most. The first {len(paced.track_ms) + paced.dropped} at {RATE_HZ:g} Hz: "
         f"{paced.cores:.2f} cores, {paced.dropped} dropped, {paced.first_pose_s:.2f} s from the start of the process to the first pose.",
     ]
     return BenchReport(
         figures={
-            "track_ms_p50": round(track[0], 1), "track_ms_p95": round(track[1], 1), "cpu_ms_p50": round(cpu[0], 1),
+            "frames": len(whole.track_ms), "track_ms_p50": round(track[0], 1), "track_ms_p95": round(track[1], 1), "cpu_ms_p50": round(cpu[0], 1),
             "cpu_ms_p95": round(cpu[1], 1), "first_ms_p50": round(float(np.median(first)), 1),
             "last_ms_p50": round(float(np.median(last)), 1), "lost": whole.lost, "keyframes": whole.keyframes,
             "keyframes_alive": whole.alive[-1], "loops": whole.loops, "memory_mb": round(whole.rss_mb),
