@@ -55,7 +55,8 @@ def detect(
         raise InputError(f"--method {method}: unknown; one of {', '.join(METHODS)}")
     direction = _parse_up(up)
     _check_writable(out)
-    settings = load_config(config).detector.slicing
+    # the answer is in the cloud's own frame, whatever that frame's error
+    settings = load_config(config).detector.slicing.model_copy(update={"map_drift_m": 0.0})
 
     _check_folders({"--pictures": pictures, "--export-trees": export_trees})
     from services.detector.readers import read_cloud

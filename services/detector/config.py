@@ -48,8 +48,8 @@ class DetectorConfig(BaseModel):
     """Share of the radius by which the side that shows differs from the whole trunk; more points do not tell."""
     off_centre: float = Field(default=0.033, ge=0.0)
     """The same for each coordinate of the axis: bark, flare and the pattern that the sensor repeats in every frame."""
-    map_drift_m: float = Field(default=0.0, ge=0.0)
-    """Error of the map itself per axis, where poses are slam's: no detection in that map can tell it."""
+    map_drift_m: float = Field(default=0.008, ge=0.0)
+    """Error of the map itself per axis, as poses are slam's: no detection in that map can tell it. ``detect``: none."""
     post_top_m: float = 2.5
     """A column that ends below this height above ground, with the space above it seen empty, is no tree."""
     trials: int = Field(default=48, gt=0)

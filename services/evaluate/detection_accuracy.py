@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from services.detector.config import DetectorConfig, DetectorServiceConfig
+from services.detector.config import DetectorServiceConfig
 from services.detector.detect import detect_trees
 from services.detector.model import DetectionResult
 from services.detector.report import as_tree
@@ -83,7 +83,7 @@ def _shares(values: Sequence[float]) -> str:
 def ours(difficulty: str) -> Detect:
     """Return our method as the service runs it; poses of slam are known to err only where they do."""
     service = DetectorServiceConfig().slicing
-    config = service if difficulty == "drift" else DetectorConfig()
+    config = service if difficulty == "drift" else service.model_copy(update={"map_drift_m": 0.0})
     return lambda scene: detect_trees(scene.points_m, (0.0, 0.0, 1.0), scene.views, config)
 
 
