@@ -36,7 +36,7 @@ class DockConfig(BaseModel):
     max_m: float = Field(default=1.00, gt=0.0)
     margin_m: float = Field(default=0.02, ge=0.0)
     """The believed mean keeps this far inside both limits, so that the true one is inside too."""
-    prefer_m: float = Field(default=0.03, gt=0.0)
+    prefer_m: float = Field(default=0.015, gt=0.0)
     """For the first ``prefer_s`` in dock only a mean this near to the aim counts: patience buys accuracy."""
     prefer_s: float = Field(default=12.0, ge=0.0)
     bearing_rad: float = Field(default=math.radians(3.0), gt=0.0)
