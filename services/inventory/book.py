@@ -43,14 +43,15 @@ class Inventory:
         self.sites = {site.number: site for site in contents.sites}
         self.flights = {flight.fid: flight for flight in contents.flights}
         self.trees = {tree.fid: tree for tree in contents.trees}
-        self.sightings = {sighting.fid: sighting for sighting in contents.sightings}
+        # somebody may have deleted rows in QGIS: such a tree is entered anew when it is seen again
+        self.sightings = {s.fid: s for s in contents.sightings if s.tree in self.trees and s.flight in self.flights}
         self.of_flight: dict[int, dict[int, Sighting]] = {fid: {} for fid in self.flights}
         self.of_tree: dict[int, dict[int, Sighting]] = {fid: {} for fid in self.trees}
         for sighting in self.sightings.values():
             self.of_flight[sighting.flight][sighting.tree_id] = sighting
             self.of_tree.setdefault(sighting.tree, {})[sighting.fid] = sighting
         self._next_tree = max(self.trees, default=0) + 1
-        self._next_sighting = max(self.sightings, default=0) + 1
+        self._next_sighting = max((s.fid for s in contents.sightings), default=0) + 1
         self._fine_ns: dict[int, int] = {}
         self._joiner = Joiner(self, config)
         self.changes = Changes()

@@ -85,7 +85,12 @@ class Keeper:
         while not self._stop.is_set():
             next_s = max(next_s + self._config.commit_s, time.monotonic())
             self._stop.wait(next_s - time.monotonic())
-            self.turn(time.time_ns())
+            try:
+                self.turn(time.time_ns())
+            except Exception:  # noqa: BLE001 - a bug here must be told and must not end the station, which commands aircraft
+                LOG.exception("this is a bug: the inventory takes nothing more until the station is started again")
+                self._tell("the inventory stopped by a bug: start the station again", "bad")
+                break
         self._store.close()
 
     def turn(self, now_ns: int) -> None:

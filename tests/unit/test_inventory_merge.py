@@ -162,6 +162,16 @@ def test_a_station_that_was_restarted_doubles_nothing() -> None:
     assert len(again.sightings) == len(book.sightings)
 
 
+def test_rows_that_somebody_deleted_are_entered_anew() -> None:
+    book = Inventory(InventoryConfig())
+    book.take("uav1", listed([tree(1, 4.0, 0.0), tree(2, 6.0, 0.0)]), S)
+    kept = tuple(t for t in book.trees.values() if t.fid != 1)
+    again = Inventory(InventoryConfig(), Contents(tuple(book.sites.values()), tuple(book.flights.values()),
+                                                  tuple(book.sightings.values()), kept))  # fmt: skip
+    again.take("uav1", listed([tree(1, 4.0, 0.0), tree(2, 6.0, 0.0)], 2 * S), 2 * S)
+    assert [t.x_m for t in again.trees.values()] == [6.0, 4.0]
+
+
 # -- several flights
 
 

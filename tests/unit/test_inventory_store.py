@@ -204,6 +204,21 @@ def test_a_disk_that_takes_nothing_is_told_and_nothing_is_lost_when_it_does_agai
     store.close()
 
 
+def test_a_bug_in_the_inventory_is_told_and_ends_nothing_else(tmp_path: Path) -> None:
+    said: list[tuple[str, str]] = []
+    keeper = Keeper(GeoPackage(tmp_path / "inventory.gpkg"), PLACED, lambda text, tone: said.append((tone, text)))
+
+    def fall(_: int) -> None:
+        raise RuntimeError("on purpose")
+
+    keeper.turn = fall  # type: ignore[method-assign]
+    keeper.start()
+    keeper._thread.join(5.0)
+    assert said == [("bad", "the inventory stopped by a bug: start the station again")]
+    keeper.offer("uav1", listed(forest(3)), frozenset())
+    keeper.close()
+
+
 def test_exports_hold_the_trees_and_no_formulas(tmp_path: Path) -> None:
     path = tmp_path / "inventory.gpkg"
     filled(path)
