@@ -18,7 +18,7 @@ from services.detector.refine.view import axis_point, project_point
 from services.simulator.render import DEFAULT_INTRINSICS
 
 RATE_HZ = 15.0
-DURATION_S = 6.0
+DURATION_S = 5.0
 HIDDEN_S = (3.0, 4.0)
 """In the fourth motion the trunk is hidden for this long."""
 _JITTER = (0.003, 0.003, 0.003, 0.001, 0.001, 0.001)
