@@ -50,7 +50,7 @@ class Inventory:
         for sighting in self.sightings.values():
             self.of_flight[sighting.flight][sighting.tree_id] = sighting
             self.of_tree.setdefault(sighting.tree, {})[sighting.fid] = sighting
-        self._next_tree = max(self.trees, default=0) + 1
+        self._next_tree = max([*self.trees, *(s.tree for s in contents.sightings)], default=0) + 1
         self._next_sighting = max((s.fid for s in contents.sightings), default=0) + 1
         self._fine_ns: dict[int, int] = {}
         self._joiner = Joiner(self, config)

@@ -87,7 +87,7 @@ class Keeper:
             self._stop.wait(next_s - time.monotonic())
             try:
                 self.turn(time.time_ns())
-            except Exception:  # noqa: BLE001 - a bug here must be told and must not end the station, which commands aircraft
+            except Exception:  # a bug here must be told, and must not end the station, which commands aircraft
                 LOG.exception("this is a bug: the inventory takes nothing more until the station is started again")
                 self._tell("the inventory stopped by a bug: start the station again", "bad")
                 break

@@ -211,7 +211,7 @@ def test_a_bug_in_the_inventory_is_told_and_ends_nothing_else(tmp_path: Path) ->
     def fall(_: int) -> None:
         raise RuntimeError("on purpose")
 
-    keeper.turn = fall  # type: ignore[method-assign]
+    keeper.turn = fall  # type: ignore[method-assign, assignment]
     keeper.start()
     keeper._thread.join(5.0)
     assert said == [("bad", "the inventory stopped by a bug: start the station again")]
