@@ -6,10 +6,12 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.mapping import Submap
 from schemas.simulation import TrueTree
 from services.detector.map_store import MapStore
+from services.detector.model import Views
 from services.evaluate.bench import BenchOptions
 from services.evaluate.bench_peers import PeerCloud, Stem
 from services.evaluate.ring import fit_centre
@@ -36,22 +38,42 @@ PINE_RADIUS_M = 0.253 / 2
 
 
 def simulated_cloud(name: str, options: BenchOptions) -> PeerCloud:
-    """Return the map of a simulated turn, and its trees at breast height."""
+    """Return the map of a simulated turn, and its trees at breast height; kept for later calls under ``options.out``."""
+    kept = options.out / "peers" / f"{name}.npz"
+    if not kept.exists():
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        _make(name, kept, options)
+    with np.load(kept) as body:
+        views = Views(
+            body["index"], body["origins_m"], body["rotations"], (float(body["tan"][0]), float(body["tan"][1]))
+        )
+        points, fair, unfair = body["points_m"], _stems(body["fair"]), _stems(body["unfair"])
+    return PeerCloud(name, points, fair, views, ignored=unfair)
+
+
+def _make(name: str, file: Path, options: BenchOptions) -> None:
     from services.evaluate.ring_turns import mapped, rendered, slam_says
     from services.evaluate.trees import read_truth
 
     with rendered(name, options) as sequence:
         mapper, _, _ = mapped(slam_says(sequence, loop_closing=True), register=False)
         trees = read_truth(sequence / "truth.json")
-
-    fair = [t for t in trees if t.fair and t.suitable]
-    unfair = [t for t in trees if not (t.fair and t.suitable)]
     store = MapStore()
     for submap in mapper.whole_map():
         if isinstance(submap, Submap):
             store.take(submap)
     points, views = store.assemble()
-    return PeerCloud(name, points.astype(np.float64), _at_breast(fair), views, ignored=_at_breast(unfair))
+    fair = [t for t in trees if t.fair and t.suitable]
+    unfair = [t for t in trees if not (t.fair and t.suitable)]
+    np.savez(
+        file, points_m=points.astype(np.float64), index=views.index, origins_m=views.origins_m,
+        rotations=views.rotations if views.rotations is not None else np.zeros((0, 3, 3)), tan=views.tan_half or (0.0, 0.0),
+        fair=_at_breast(fair), unfair=_at_breast(unfair),
+    )  # fmt: skip
+
+
+def _stems(rows: NDArray[np.float64]) -> tuple[Stem, ...]:
+    return tuple((float(x), float(y), float(r)) for x, y, r in rows.reshape(-1, 3))
 
 
 def _at_breast(trees: Sequence[TrueTree]) -> tuple[Stem, ...]:
