@@ -159,3 +159,28 @@ def test_a_transform_that_is_none_is_refused(tmp_path: Path, T: object) -> None:
     found = read_camera(file).T_body_camera
     assert found is not None
     assert np.array_equal(found, np.eye(4))
+
+
+def test_mapper_refiner_and_slam_honour_the_lens_themselves() -> None:
+    """What makes resampling needless: each puts the bent camera's pixels on the true plane."""
+    from services.detector.refine.view import ray_table
+    from services.mapper.cloud import pixel_rays
+    from services.slam.config import SlamConfig
+    from services.slam.features import Extractor
+
+    image, plane = bent_frame()
+    z = decode_depth_m(image).astype(np.float64)
+    u, v = np.meshgrid(np.arange(160.0), np.arange(120.0))
+    straight = Extractor(BENT, SlamConfig()).undistort(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(120, 160, 2)
+    mapped = pixel_rays(BENT)
+    seen = {
+        "mapper": (mapped[..., 0], mapped[..., 1]), "refiner": ray_table(BENT),
+        "slam": ((straight[..., 0] - BENT.cx) / BENT.fx, (straight[..., 1] - BENT.cy) / BENT.fy),
+        "nobody": ((u - BENT.cx) / BENT.fx, (v - BENT.cy) / BENT.fy),
+    }  # fmt: skip
+    off = {}
+    for name, (x, y) in seen.items():
+        points = np.stack([x * z, y * z, z], axis=-1)
+        off[name] = float(np.nanmax(np.abs(points @ plane[:3] - plane[3])))
+    assert max(off["mapper"], off["refiner"], off["slam"]) < 0.001, off
+    assert off["nobody"] > 0.02
