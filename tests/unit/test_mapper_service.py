@@ -145,3 +145,22 @@ def test_what_is_seen_from_nearer_gets_in() -> None:
     dense.add(0, 0, _patch(5.0, seed=1), level_camera([0, 0, 1.5], 0.0))
     dense.add(1, 1, _patch(1.5, seed=1), level_camera([3.5, 0, 1.5], 0.0))
     assert len(dense.submaps[1].points_m) > 0.9 * 3000
+
+
+def test_registration_moves_a_cloud_within_its_keyframe_and_rides_on_it() -> None:
+    hub = Hub(TreedockConfig(mapper=MapperConfig(register_clouds=True, registration_sigma_m=0.02)))
+    mapper, slam = build(hub.context("mapper")), hub.context("slam")
+    for number, x in enumerate((0.0, 0.0, 0.03)):  # the wall is 2 m from all three: the third is 3 cm off
+        slam.publish(SLAM_KEYFRAME, _keyframe(number, level_camera([x, 0.02 * number, 1.5], 0.1 * number)))
+        hub.run()
+    health = mapper._context.health
+    assert health.counters["registered"] + health.counters["not_registered"] == 3
+    third = mapper.map.submaps[2]
+    assert np.linalg.norm(third.T_anchor_submap[:3, 3]) < 0.1, "never far from where slam put it"
+    before = third.T_map_submap.copy()
+    lift = np.eye(4)
+    lift[2, 3] = 1.0
+    poses = {k: lift @ level_camera([x, 0.02 * k, 1.5], 0.1 * k) for k, x in enumerate((0.0, 0.0, 0.03))}
+    slam.publish(SLAM_GRAPH, _graph(2, poses))
+    hub.run()
+    assert third.T_map_submap == pytest.approx(lift @ before)
