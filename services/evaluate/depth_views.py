@@ -7,12 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.camera import Intrinsics
 from services.common.geometry import level_camera
+
+if TYPE_CHECKING:
+    from services.simulator.render import Renderer
+    from services.simulator.scene import Scene
+    from services.simulator.sensor import RgbdSensor
 
 Image = NDArray[np.float32]
 Grey = NDArray[np.uint8]
@@ -116,15 +123,7 @@ def beside(seed: int) -> PairShot:
 def _look(scene_name: str, poses: Sequence[Floats], first: int) -> Iterator[Shot]:
     import cv2
 
-    from services.simulator.catalogue import scene_by_name
-    from services.simulator.config import SensorConfig
-    from services.simulator.render import DEFAULT_INTRINSICS, Renderer
-    from services.simulator.sensor import RgbdSensor
-    from services.simulator.world import World
-
-    scene = scene_by_name(scene_name)
-    renderer = Renderer(World(scene), DEFAULT_INTRINSICS)
-    sensor = RgbdSensor(SensorConfig(), (DEFAULT_INTRINSICS.height, DEFAULT_INTRINSICS.width))
+    scene, renderer, sensor = _stage(scene_name)
     before, rendering = None, None
     for k, T in enumerate(poses):
         if rendering is None or before is not T:
@@ -134,3 +133,17 @@ def _look(scene_name: str, poses: Sequence[Floats], first: int) -> Iterator[Shot
         images = sensor.expose(rendering, first + k)
         grey = np.asarray(cv2.cvtColor(images.colour, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
         yield Shot(rendering.depth_m.copy(), images.depth.astype(np.float32) / np.float32(1000.0), grey)
+
+
+@lru_cache(maxsize=len(KINDS) + 1)
+def _stage(scene_name: str) -> tuple[Scene, Renderer, RgbdSensor]:
+    """Return a scene with what renders it: making its world costs as much as seven pictures of it."""
+    from services.simulator.catalogue import scene_by_name
+    from services.simulator.config import SensorConfig
+    from services.simulator.render import DEFAULT_INTRINSICS, Renderer
+    from services.simulator.sensor import RgbdSensor
+    from services.simulator.world import World
+
+    scene = scene_by_name(scene_name)
+    shape = (DEFAULT_INTRINSICS.height, DEFAULT_INTRINSICS.width)
+    return scene, Renderer(World(scene), DEFAULT_INTRINSICS), RgbdSensor(SensorConfig(), shape)
