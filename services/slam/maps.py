@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import Protocol
 
 from schemas.camera import Intrinsics
-from services.common.context import HealthBook
 from services.slam.config import SlamConfig
 from services.slam.keeper import Keeper, take_up
 from services.slam.results import TrackResult
@@ -18,6 +18,18 @@ LOG = logging.getLogger(__name__)
 
 _ABOUT = "map"
 _TELL_NS = 10_000_000_000
+
+
+class Book(Protocol):
+    """Where what has happened is told: the service's health."""
+
+    def count(self, name: str) -> None:
+        """Add one to a counter."""
+        ...
+
+    def note(self, topic: str, text: str) -> None:
+        """Say what is wrong; an empty text withdraws it."""
+        ...
 
 
 class LockstepMap:
@@ -45,7 +57,7 @@ class LockstepMap:
 class LiveMaps:
     """One map after another, mapped by a thread beside tracking and kept in ``folder`` (None: not kept)."""
 
-    def __init__(self, config: SlamConfig, folder: Path | None, health: HealthBook) -> None:
+    def __init__(self, config: SlamConfig, folder: Path | None, health: Book) -> None:
         self._config = config
         self._health = health
         self.crew: Crew = Beside()
