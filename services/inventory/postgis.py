@@ -40,13 +40,21 @@ class PostGis:
                 "inventory: a postgresql:// database needs the driver psycopg: pip install 'treedock[postgis]'"
             ) from None
         self.path = url.rpartition("@")[2]  # the part without a password, for messages
+        self.failure: type[Exception] = psycopg.Error
+        self._open = lambda: psycopg.connect(url, row_factory=dict_row, connect_timeout=5)
         try:
-            self._db: Any = psycopg.connect(url, row_factory=dict_row, connect_timeout=5)
+            self._db: Any = self._open()
+        except psycopg.Error as error:
+            raise InputError(f"inventory {self.path}: {' '.join(str(error).split())}") from error
+        try:
             if not read_only:
                 self._create()
         except psycopg.Error as error:
+            self._db.close()
             raise InputError(f"inventory {self.path}: {' '.join(str(error).split())}") from error
-        self.failure: type[Exception] = psycopg.Error
+        except InputError:
+            self._db.close()
+            raise
 
     def _create(self) -> None:
         with self._db.transaction():
@@ -79,8 +87,12 @@ class PostGis:
         """Write all changes in one transaction.
 
         Raises:
-            psycopg.Error: the server refused or is gone; nothing was written then.
+            psycopg.Error: the server refused or is gone; nothing was written then, and it is connected to again next time.
         """
+        if self._db.closed:
+            self._db = self._open()
+            with self._db.transaction():
+                self._db.execute("SELECT pg_try_advisory_lock(%s)", (_LOCK,))
         with self._db.transaction(), self._db.cursor() as cursor:
             self._upsert(cursor, "sites", [schema.site_row(v) for v in changes.sites.values()])
             self._upsert(cursor, "flights", [schema.flight_row(v) for v in changes.flights.values()])

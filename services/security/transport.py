@@ -8,7 +8,7 @@ from pathlib import Path
 from services.common.errors import InputError
 from services.security.access import access_control, radio_rules
 from services.security.config import SecurityConfig
-from services.security.identity import READER, Identity
+from services.security.identity import READER, STATION, Identity
 from services.security.register import Register
 
 Settings = dict[str, object]
@@ -40,6 +40,8 @@ def pair_of(security: SecurityConfig, uav: str, service: str | None) -> Pair | N
     if folder is None:
         return None
     text = f"{uav}.{service}" if service else security.identity or f"{uav}.{READER}"
+    if service == STATION and security.identity.startswith(f"{STATION}."):
+        text = security.identity  # a ground station of all aircraft, not one aircraft's own
     identity = Identity.parse(text)
     pair = Pair(folder / "ca.pem", folder / f"{identity.text}.pem", folder / f"{identity.text}.key")
     for path in (pair.ca, pair.certificate, pair.key):

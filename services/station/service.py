@@ -118,7 +118,10 @@ class Station:
         direct: zenoh.handlers.Callback[zenoh.Sample]
         direct = zenoh.handlers.Callback(lambda sample: c.inbox.put(tokens, sample), indirect=False)
         session = c.bus.session
-        self._kept.append(session.liveliness().declare_subscriber(f"{PREFIX}/*/live/*", direct, history=True))
+        # a certificate for one aircraft allows that one's tokens only, and nothing that is wider
+        for uav in ("*", self._context.uav):
+            key = f"{PREFIX}/{uav}/live/*"
+            self._kept.append(session.liveliness().declare_subscriber(key, direct, history=True))
         c.every_wall(1.0 / self.config.page_hz, lambda: self.brain.tell_state(time.monotonic()))
         c.every_wall(1.0, self._each_second)
         c.on_stop(self._stop)

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import datetime as dt
+from pathlib import Path
+
 import pytest
 
+from services.security.authority import Authority
+from services.security.config import SecurityConfig
+from services.security.identity import Identity
+from services.security.transport import pair_of
 from services.station.config import StationConfig
 from services.station.guard import HEADERS, Guard, cookie_of, host_name
 
@@ -62,3 +69,21 @@ def test_config_knows_what_is_local_and_what_belongs_together() -> None:
     for bad in ({"token": "short"}, {"tls_certificate": "a"}, {"tls_client_ca": "a"}, {"token": "with space" * 3}):
         with pytest.raises(ValueError, match=r"token|tls"):
             StationConfig(**bad)  # type: ignore[arg-type]
+
+
+def test_a_ground_station_shows_its_own_certificate_where_it_has_one(tmp_path: Path) -> None:
+    now = dt.datetime(2026, 11, 1, tzinfo=dt.UTC)
+    authority = Authority.create(tmp_path, now)
+    for name in ("station.alice", "uav1.station", "uav1.slam"):
+        authority.issue(Identity.parse(name), now)
+    shown = {}
+    for identity in ("station.alice", ""):
+        security = SecurityConfig(folder=tmp_path, identity=identity)
+        for service in ("station", "slam"):
+            pair = pair_of(security, "uav1", service)
+            assert pair is not None
+            shown[identity, service] = pair.certificate.name
+    assert shown == {
+        ("station.alice", "station"): "station.alice.pem", ("station.alice", "slam"): "uav1.slam.pem",
+        ("", "station"): "uav1.station.pem", ("", "slam"): "uav1.slam.pem",
+    }  # fmt: skip
