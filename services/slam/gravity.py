@@ -20,6 +20,8 @@ SIGMA_ACCEL_RAD = math.radians(3.0)
 """A hand-held or hovering camera's single reading against true gravity."""
 SIGMA_ATTITUDE_RAD = math.radians(0.8)
 """The autopilot's: its own accelerometer's bias."""
+SIGMA_GROUND_RAD = math.radians(6.0)
+"""Ground slopes."""
 SIGMA_UNKNOWN_RAD = math.radians(10.0)
 """The first camera taken as level."""
 STANDARD_M_S2 = 9.80665
@@ -191,14 +193,20 @@ class Upright:
         self._levels = (Level(), Level(feels_motion=False))
         self._corrected_ns = -(10**18)
 
-    def begin(self, accel_camera: F64 | None, attitude_up_camera: F64 | None) -> F64 | None:
-        """Return the first camera's up (3,), None when no sensor tells it."""
+    def begin(
+        self, accel_camera: F64 | None, attitude_up_camera: F64 | None, ground_up_camera: Callable[[], F64 | None]
+    ) -> F64 | None:
+        """Return the first camera's up (3,): from the autopilot, else the accelerometer, else the ground; None: nothing."""
         if attitude_up_camera is not None:
             self.sigma_rad = SIGMA_ATTITUDE_RAD
             return attitude_up_camera
         if accel_camera is not None:
             self.sigma_rad = SIGMA_ACCEL_RAD
-        return accel_camera
+            return accel_camera
+        ground = ground_up_camera()
+        if ground is not None:
+            self.sigma_rad = SIGMA_GROUND_RAD
+        return ground
 
     def feel(
         self, stamp_ns: int, keyframe: int, T_keyframe_camera: F64, accel_camera: F64 | None,

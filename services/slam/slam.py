@@ -21,6 +21,7 @@ from services.slam.atlas import Atlas
 from services.slam.camera import camera_model
 from services.slam.config import SlamConfig
 from services.slam.features import Extractor, Features
+from services.slam.ground import ground_up
 from services.slam.keyframing import KeyframeRule
 from services.slam.links import shared_counts
 from services.slam.loops import Loops
@@ -108,7 +109,7 @@ class Slam:
         features = self._extractor.extract(grey, depth_m)
         with self.crew.frame():
             if self.graph_version == 0:
-                return self._initialise(stamp_ns, features, accel_camera, attitude_up_camera)
+                return self._initialise(stamp_ns, features, depth_m, accel_camera, attitude_up_camera)
             graph = self._catch_up()
             graph = self._level_map() or graph
             frame = self._locate(stamp_ns, features, depth_m)
@@ -120,10 +121,13 @@ class Slam:
             self._felt = (stamp_ns, accel_camera, attitude_up_camera)
             return self._accept(stamp_ns, frame, graph)
 
-    def _initialise(self, stamp_ns: int, features: Features, accel: F64 | None, attitude: F64 | None) -> TrackResult:
+    def _initialise(
+        self, stamp_ns: int, features: Features, depth_m: NDArray[np.float32], accel: F64 | None, attitude: F64 | None
+    ) -> TrackResult:
         if np.count_nonzero(features.depth > 0.0) < _MIN_START_POINTS:
             return self._result(stamp_ns, "initialising", None, [], None)
-        T_camera_map = inverse(gravity.first_pose(self._upright.begin(accel, attitude)))
+        up = self._upright.begin(accel, attitude, lambda: ground_up(depth_m, self.intrinsics))
+        T_camera_map = inverse(gravity.first_pose(up))
         frame = Tracked(
             features, np.ascontiguousarray(T_camera_map[:3, :3]), T_camera_map[:3, 3].copy(),
             np.full(len(features), -1, np.int32), len(features), np.eye(6) * 1e8,

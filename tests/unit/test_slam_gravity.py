@@ -8,8 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from schemas.camera import Intrinsics
 from services.common.geometry import exp_rotation, level_camera, pose, rotation_z
 from services.slam import gravity
+from services.slam.ground import ground_up
 
 F64 = NDArray[np.float64]
 RATE_HZ = 15.0
@@ -99,7 +101,7 @@ def test_no_window_spans_a_gap() -> None:
 def test_an_attitude_tells_gravity_without_the_cameras_motion() -> None:
     upright = gravity.Upright()
     up = np.array([0.0, -1.0, 0.0])
-    upright.begin(None, up)
+    upright.begin(None, up, lambda: None)
     assert upright.sigma_rad == gravity.SIGMA_ATTITUDE_RAD
     asked = []
     lean = exp_rotation([0.02, 0.0, 0.0])
@@ -114,9 +116,45 @@ def test_an_attitude_tells_gravity_without_the_cameras_motion() -> None:
 
 def test_an_upright_map_is_left_alone_and_becomes_sure() -> None:
     upright = gravity.Upright()
-    upright.begin(np.array([0.0, -9.8, 0.0]), None)
+    upright.begin(np.array([0.0, -9.8, 0.0]), None, lambda: None)
     for k in range(300):
         T = level_camera([0.0, 0.0, 0.0], 0.03 * k)
         accel = T[:3, :3].T @ np.array([0.0, 0.0, 9.8])
         assert upright.feel(round(k / RATE_HZ * 1e9), 0, T, accel, None, here) is None
     assert np.degrees(upright.sigma_rad) == pytest.approx(0.15, abs=0.1)
+
+
+CAMERA = Intrinsics(width=320, height=240, fx=250.0, fy=250.0, cx=159.5, cy=119.5)
+
+
+def plane_seen(up: F64, height_m: float) -> NDArray[np.float32]:
+    """Depth (240, 320) of a plane ``height_m`` below a camera for which up is ``up``; 1 cm of noise."""
+    u, v = np.meshgrid(np.arange(320), np.arange(240))
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1)
+    with np.errstate(divide="ignore"):
+        z = -height_m / (rays @ up)
+    z += np.random.default_rng(3).normal(0.0, 0.01, z.shape)
+    return np.where((z > 0.3) & (z < 8.0), z, 0.0).astype(np.float32)
+
+
+@settings(max_examples=15, deadline=None)
+@given(pitch=st.floats(-0.5, 0.2), roll=st.floats(-0.3, 0.3), height_m=st.floats(0.4, 2.0))
+def test_the_ground_tells_up_where_no_sensor_does(pitch: float, roll: float, height_m: float) -> None:
+    up = exp_rotation([pitch, 0.0, roll]) @ np.array([0.0, -1.0, 0.0])
+    depth_m = plane_seen(up, height_m)
+    depth_m[100:, 40:90] = np.where(depth_m[100:, 40:90] > 0.0, 1.0, 0.0)  # something stands on it
+    found = ground_up(depth_m, CAMERA)
+    if found is not None:
+        assert lean_deg(found, up) < 2.0
+    else:
+        assert np.count_nonzero(depth_m[96:]) < 0.3 * depth_m[96:].size
+
+
+def test_a_wall_ahead_is_no_ground() -> None:
+    assert ground_up(np.full((240, 320), 2.0, np.float32), CAMERA) is None
+    assert ground_up(np.zeros((240, 320), np.float32), CAMERA) is None
+    upright = gravity.Upright()
+    assert upright.begin(None, None, lambda: None) is None
+    assert upright.sigma_rad == gravity.SIGMA_UNKNOWN_RAD
+    assert upright.begin(None, None, lambda: np.array([0.0, -1.0, 0.0])) is not None
+    assert upright.sigma_rad == gravity.SIGMA_GROUND_RAD
