@@ -106,7 +106,7 @@ def test_frontal_pictures_are_a_clear_no() -> None:
 
 
 def test_a_board_of_another_size_is_told(views: dict[str, list[Grey]]) -> None:
-    result = judged(views["checkerboard"][:3], Board(8, 6))
+    result = judged(views["checkerboard"][:1], Board(8, 6))
     assert "8 x 6 inner corners, that is 9 x 7 squares" in result.faults[0]
 
 

@@ -62,19 +62,24 @@ class Sighting:
     """(N, 2)."""
 
 
-def find_board(grey: Grey, board: Board) -> Sighting | None:
-    """Return the board's corners in a (H, W) picture, None when it is not there (whole, for a checkerboard)."""
-    return _find_charuco(grey, board) if board.kind == "charuco" else _find_checkerboard(grey, board)
+def find_board(grey: Grey, board: Board, *, thorough: bool = True) -> Sighting | None:
+    """Return the board's corners in a (H, W) picture, None when it is not there (whole, for a checkerboard).
+
+    ``thorough``: look a second time, which takes a second, where a first look finds none; a live picture is not worth it.
+    """
+    if board.kind == "charuco":
+        return _find_charuco(grey, board)
+    return _find_checkerboard(grey, board, thorough=thorough)
 
 
-def _find_checkerboard(grey: Grey, board: Board) -> Sighting | None:
+def _find_checkerboard(grey: Grey, board: Board, *, thorough: bool) -> Sighting | None:
     """Find a whole checkerboard (Duda and Frese 2018, as OpenCV has it: accurate below a tenth of a pixel)."""
     import cv2
 
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
     size = (board.columns, board.rows)
     found, corners = cv2.findChessboardCornersSB(grey, size, flags=flags)
-    if not found:
+    if not found and thorough:
         found, corners = cv2.findChessboardCornersSB(grey, size, flags=flags | cv2.CALIB_CB_EXHAUSTIVE)
     if not found:
         return None

@@ -107,7 +107,7 @@ def from_live(items: Iterable[RgbdFrame | BadFrame], board: Board, limits: Limit
         if collector is None:
             size = (grey.shape[1], grey.shape[0])
             collector = Collector(board, size, limits.needs, most)
-        picture = look(name, grey, board, limits)
+        picture = look(name, grey, board, limits, thorough=False)
         if picture.sighting is None:
             faults[picture.fault.split(":")[0]] = faults.get(picture.fault.split(":")[0], 0) + 1
             now = f"{picture.fault}"

@@ -70,9 +70,9 @@ def scale(width_px: int) -> float:
     return max(1.0, width_px / _WIDTH_PX)
 
 
-def look(name: str, grey: Grey, board: Board, limits: Limits) -> Picture:
+def look(name: str, grey: Grey, board: Board, limits: Limits, *, thorough: bool = True) -> Picture:
     """Find the board in a picture and judge the picture's sharpness."""
-    sighting = find_board(grey, board)
+    sighting = find_board(grey, board, thorough=thorough)
     if sighting is None:
         return Picture(name, "board not found")
     width = edge_width_px(grey, board, sighting)
