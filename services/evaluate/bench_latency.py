@@ -8,7 +8,6 @@ dropped where a service is still busy, as from any camera.
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import subprocess
 import sys
@@ -29,7 +28,7 @@ from schemas.topics import CAMERA_RGBD, HEALTH, SIM_RGBD, SLAM_POSE, TREES_TARGE
 from schemas.trees import Target
 from services.common.config import TreedockConfig
 from services.common.errors import InputError
-from services.evaluate.bench import BenchOptions, BenchReport
+from services.evaluate.bench import BenchOptions, BenchReport, code_version
 
 if TYPE_CHECKING:
     from services.common.bus import Bus
@@ -100,8 +99,7 @@ def run(options: BenchOptions) -> BenchReport:
         "|---|---|---|---|---|---|---|---|---|",
     ]
     stages: list[str] = []
-    with _recording(name, wanted, options) as folder:
-        frames = read_frames(folder, wanted)
+    frames = read_frames(_recording(name, wanted, options), wanted)
     for rate in rates:
         seen = measure(frames, rate)
         found = figures_of(seen)
@@ -117,20 +115,23 @@ def run(options: BenchOptions) -> BenchReport:
     return BenchReport(figures, conditions, "\n".join([*lines, "", *stages]).rstrip())
 
 
-@contextlib.contextmanager
-def _recording(name: str, frames: int, options: BenchOptions) -> Iterator[Path]:
+def _recording(name: str, frames: int, options: BenchOptions) -> Path:
+    """Return the folder of a recording; a rendered one is kept for the next call."""
     if name.startswith("tum:"):
-        yield Path(name.removeprefix("tum:"))
-        return
+        return Path(name.removeprefix("tum:"))
     from services.simulator.catalogue import scene_by_name
     from services.simulator.write import write_sequence
 
     store = options.out / "sequences"
-    store.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f"latency-{name}-", dir=store) as folder:
-        options.tell(f"rendering {frames} frames of {name}")
-        write_sequence(scene_by_name(name), Path(folder), rate_hz=_RECORDED_HZ, frames=frames)
-        yield Path(folder)
+    kept = store / f"latency-{name}-{frames}-{code_version(('services.simulator',))}"
+    if not kept.is_dir():
+        store.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f"latency-{name}-", dir=store) as folder:
+            options.tell(f"rendering {frames} frames of {name}")
+            sequence = Path(folder) / name
+            write_sequence(scene_by_name(name), sequence, rate_hz=_RECORDED_HZ, frames=frames)
+            sequence.rename(kept)
+    return kept
 
 
 def read_frames(recording: Path, count: int) -> list[RgbdFrame]:
