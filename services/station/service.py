@@ -58,6 +58,7 @@ LOG = logging.getLogger(__name__)
 _REQUEST_RING = 512
 _TOKEN_RING = 1_024
 _ORDERS_AT_ONCE = 8
+_NOT_ABOARD = frozenset({"router", "recorder"})
 _CLOUD_ASKS, _CLOUD_TIMEOUT_S = 12, 5.0
 _TOPICS: dict[Topic, Callable[[Aircraft, Any], object]] = {
     SLAM_POSE: Aircraft.on_pose, MISSION_STATE: Aircraft.on_mission, VEHICLE_STATE: Aircraft.on_vehicle,
@@ -141,6 +142,8 @@ class Station:
             return
         uav, service = parts[2], parts[4]
         alive = sample.kind == zenoh.SampleKind.PUT
+        if service in _NOT_ABOARD and uav not in self._buses:
+            return  # the ground's own router makes no aircraft
         if self._bus_of(uav) is not None:
             self.brain.aircraft(uav).on_live(service[:64], alive=alive)
 

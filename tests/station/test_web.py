@@ -183,6 +183,14 @@ def test_hostile_words_never_become_markup(ground: Ground, page: Page) -> None:
         assert page.evaluate("document.body.dataset.hacked ?? ''") == ""
 
 
+def test_a_router_alone_is_no_aircraft(ground: Ground) -> None:
+    client = Client(ground)
+    for _ in range(5):
+        assert client.aircraft() == []
+    ground.aircraft("uav1")
+    assert until(lambda: client.aircraft() == ["uav1"])
+
+
 def test_strangers_keys_and_names_do_no_harm(ground: Ground) -> None:
     """Garbage on every key, tokens of a hundred aircraft, names that are no names."""
     ground.aircraft("uav1")
