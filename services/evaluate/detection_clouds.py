@@ -91,16 +91,17 @@ def scene_cloud(name: str, cache: Path, drift: Drift | None = None) -> SceneClou
     Raises:
         InputError: for an unknown scene.
     """
-    shots = _cached_shots(name, cache)
     label = json.dumps([name, None if drift is None else repr(drift), code_version(_FUSION)])
-    path = cache / f"cloud-{zlib.crc32(label.encode()):08x}-{name}.npz"
-    store = _load_store(path) if path.exists() else None
-    if store is None:
+    path, shown = cache / f"cloud-{zlib.crc32(label.encode()):08x}-{name}.npz", _shots_path(name, cache)
+    if not path.exists() or not shown.exists():
+        shots = _cached_shots(name, cache)
         poses = shots.poses if drift is None else wrong_poses(shots.poses, drift, zlib.crc32(name.encode()))
         store = fuse(shots.depth, poses)
         _save(path, points=store[0], index=store[1], origins=store[2], rotations=store[3], tan_half=np.array(store[4]))
-    points, index, origins, rotations, tan_half = store
-    return SceneCloud(name, points, Views(index, origins, rotations, tan_half), shots.trees)
+    points, index, origins, rotations, tan_half = _load_store(path)
+    with np.load(shown) as held:  # only the truth is unpacked
+        trees = _trees(str(held["trees"]))
+    return SceneCloud(name, points, Views(index, origins, rotations, tan_half), trees)
 
 
 _Parts = tuple[NDArray[np.float32], NDArray[np.int32], Floats, Floats, tuple[float, float]]
@@ -177,12 +178,19 @@ def keyframes(poses: Sequence[Floats]) -> list[Floats]:
     return taken if taken[-1] is poses[-1] else [*taken, poses[-1]]
 
 
+def _shots_path(name: str, cache: Path) -> Path:
+    return cache / f"depth-{code_version(_SIMULATOR)}-{name}.npz"
+
+
+def _trees(text: str) -> tuple[TrueTree, ...]:
+    return tuple(TrueTree.model_validate_json(tree) for tree in json.loads(text))
+
+
 def _cached_shots(name: str, cache: Path) -> _Shots:
-    path = cache / f"depth-{code_version(_SIMULATOR)}-{name}.npz"
+    path = _shots_path(name, cache)
     if path.exists():
         with np.load(path) as held:
-            trees = tuple(TrueTree.model_validate_json(text) for text in json.loads(str(held["trees"])))
-            return _Shots(held["depth"], held["poses"], trees)
+            return _Shots(held["depth"], held["poses"], _trees(str(held["trees"])))
     shots = _render(name)
     trees_text = json.dumps([tree.model_dump_json() for tree in shots.trees])
     _save(path, small=True, depth=shots.depth, poses=shots.poses, trees=np.array(trees_text))
