@@ -271,7 +271,7 @@ export class MapView {
     }
     circle(c, u, v, r);
     if (kind === "unsuitable") {
-      c.setLineDash([3, 2.5]);
+      if (r > 6) c.setLineDash([3, 2.5]);
       c.strokeStyle = colour;
       c.lineWidth = 2;
       c.fillStyle = k.map;
