@@ -31,11 +31,11 @@ class SlamConfig(BaseModel):
     """Standard deviation of the inverse of that distance, 1/m. Both are learned anew once parallax has told enough distances."""
     baseline_m: float = Field(default=0.08, gt=0)
     """Virtual stereo baseline: depth enters as the disparity ``fx * baseline / z``, whose noise is constant."""
-    disparity_sigma_px: float = Field(default=0.3, gt=0)
+    disparity_sigma_px: float = Field(default=0.6, gt=0)
     """Noise of that disparity."""
     min_inliers: int = Field(default=25, ge=6)
     """Fewer matches of the map than this: lost."""
-    keyframe_ratio: float = Field(default=0.8, gt=0, le=1)
+    keyframe_ratio: float = Field(default=0.85, gt=0, le=1)
     """A new keyframe when the inliers fall below this share of the most since the last one."""
     close_tracked_min: int = Field(default=100, ge=0)
     close_untracked_max: int = Field(default=70, ge=0)
