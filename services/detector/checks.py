@@ -12,6 +12,7 @@ from services.detector.upright import Floats32, Upright
 from services.detector.voxels import Voxels
 
 _BAND_M = 0.15
+_BURIED_M = 0.3
 _MAX_FILL = 0.4
 """Real trunks in five terrestrial clouds have 0 to 0.3, circles in undergrowth 0.4 to 0.7."""
 
@@ -22,12 +23,16 @@ def axis_at(cylinder: Cylinder, z_m: float) -> Floats:
 
 
 def base_point(cylinder: Cylinder, ground: Ground) -> Floats:
-    """Return where the axis meets the ground (3,), upright frame (a few fixed-point steps)."""
+    """Return where the axis meets the ground (3,), upright frame (a few fixed-point steps).
+
+    Where the trunk is seen well below the ground's plane, that plane is wrong (a steep place that no point showed): the
+    lowest part seen is then the best there is.
+    """
     z = cylinder.z_low_m
     for _ in range(6):
         p = axis_at(cylinder, z)
         z = ground.height_m(float(p[0]), float(p[1]))
-    return axis_at(cylinder, z)
+    return axis_at(cylinder, min(z, cylinder.z_low_m + _BURIED_M))
 
 
 def shape_fault(cylinder: Cylinder, low_m: float, high_m: float, span_m: float, config: DetectorConfig) -> str:
