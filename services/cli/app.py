@@ -21,7 +21,22 @@ from services.cli.topic import topic_app
 from services.common.errors import GoalNotReachedError, InputError
 from services.common.process import prepare_process
 
-COMMAND_MODULES = ("process", "detect", "simulate", "calibrate", "catalogue", "bench", "warm", "command", "station", "record", "recordings", "replay", "view", "doctor")
+COMMAND_MODULES = (
+    "process",
+    "detect",
+    "simulate",
+    "calibrate",
+    "catalogue",
+    "bench",
+    "warm",
+    "command",
+    "station",
+    "record",
+    "recordings",
+    "replay",
+    "view",
+    "doctor",
+)
 """Modules beside this one that hold one command of the same name each."""
 
 EXIT_DONE, EXIT_BUG, EXIT_INPUT, EXIT_NO_GOAL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130

@@ -17,7 +17,7 @@ import typer
 
 from services.cli import scratch
 from services.cli.options import AsJson, ConfigFile, Port, Settings, loaded
-from services.cli.run_plan import expected_frames, services_for, with_port, with_state, with_trees
+from services.cli.run_plan import expected_frames, services_for, with_port, with_recorder, with_state, with_trees
 from services.common.errors import InputError
 from services.station.launch import announce, with_station
 
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 _EXIT_NOT_REACHED = 3
 _ROUTER_WITHIN_S = 60.0
 _LOOK_S = 0.2
+_REPORT_WITHIN_S = 2.0
 _TRIES = 4
 
 
@@ -49,6 +50,7 @@ def run(
     trees: Annotated[int | None, typer.Option("--trees", help="Trees to dock at.", min=1)] = None,
     handheld: Annotated[bool, typer.Option("--handheld", help="A person carries the camera.")] = False,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Open no browser.")] = False,
+    record: Annotated[Path | None, typer.Option("--record", help="Record everything into this folder (MCAP).")] = None,
     logs: Annotated[Path | None, typer.Option("--logs", help="Keep the services' logs in this folder.")] = None,
     as_json: AsJson = False,
     config: ConfigFile = None,
@@ -63,6 +65,7 @@ def run(
     flags = {"camera.source": source, "simulator.seed": seed, "simulator.scene": scene,
              "navigator.trees_wanted": trees, "navigator.handheld": True if handheld else None}  # fmt: skip
     tree = with_trees(loaded(config, settings, port, {k: v for k, v in flags.items() if v is not None}).config)
+    tree = with_recorder(tree, record, logs)
     expected = expected_frames(tree)
 
     def configured() -> TreedockConfig:
@@ -92,6 +95,7 @@ class Run:
         self._console = console
         self._as_json = as_json
         self._browser = browser
+        self._begun_s = time.time()
         self._keep_logs = logs is not None
         self._own_folder = logs is None
         self._folder = logs or scratch.made()
@@ -244,9 +248,20 @@ class Run:
         values = figures(watch, supervisor, duration_s)
         if conductor is not None:
             values["mission"] = conductor.figures()
+            values["report"] = self._report(watch)
         if supervisor.restarts and not self._keep_logs:
             values["logs"] = str(self._folder)
         return values
+
+    def _report(self, watch: Watch) -> str | None:
+        """Return where the recorder wrote this mission's report, None when it has not within two seconds."""
+        deadline_s = time.monotonic() + _REPORT_WITHIN_S
+        while time.monotonic() < deadline_s:
+            found = [p for p in self._tree.recorder.folder.glob("*report*.html") if p.stat().st_mtime >= self._begun_s]
+            if found:
+                return str(max(found, key=lambda path: path.stat().st_mtime))
+            watch.pump(_LOOK_S)
+        return None
 
     def _print(self, watch: Watch, values: dict[str, Any]) -> None:
         from rich.console import Console

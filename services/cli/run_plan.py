@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -45,6 +46,19 @@ def with_state(tree: TreedockConfig, folder: Path) -> TreedockConfig:
     if tree.slam.map_folder is None:
         update["slam"] = tree.slam.model_copy(update={"map_folder": folder / "slam"})
     return tree.model_copy(update=update)
+
+
+def with_recorder(tree: TreedockConfig, record: Path | None, logs: Path | None) -> TreedockConfig:
+    """Return ``tree`` with a recorder: of everything into ``record``, else of the missions' reports alone.
+
+    The reports then lie beside the kept ``logs``, or in the user's state folder.
+    """
+    if record is not None:
+        update: dict[str, object] = {"folder": record.absolute()}
+    else:
+        state = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
+        update = {"mcap": False, "folder": logs.absolute() / "reports" if logs else state / "treedock" / "reports"}
+    return tree.model_copy(update={"recorder": tree.recorder.model_copy(update=update)})
 
 
 def expected_frames(tree: TreedockConfig) -> int | None:
@@ -91,7 +105,10 @@ def services_for(tree: TreedockConfig) -> tuple[str, ...]:
     """Return the services of a run, in the order in which they start."""
     from services.cli.mission import flies, guides
 
-    chain = ("router", *station_services(), "camera", "slam", "mapper", "detector", "refiner")
+    station = station_services()
+    shown = (*station, "preview") if station else ()
+    kept = ("recorder",) if tree.recorder.mcap or flies(tree) or guides(tree) else ()
+    chain = ("router", *shown, *kept, "camera", "slam", "mapper", "detector", "refiner")
     if flies(tree):
         return (*chain, "navigator", "autopilot", "simulator")
     if guides(tree):

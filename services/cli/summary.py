@@ -116,7 +116,8 @@ def mission_lines(values: dict[str, Any]) -> list[str]:
             f"never nearer than {mission['clearance_m']:.2f} m to anything"
         )
     word = "docked" if mission["docked"] else "NOT docked"
-    return [*lines, f"{word}; mission {mission['state']}: {mission['reason']}"]
+    lines.append(f"{word}; mission {mission['state']}: {mission['reason']}")
+    return [*lines, f"report: {values['report']}"] if values.get("report") else lines
 
 
 def _dock_line(dock: dict[str, Any]) -> str:

@@ -17,6 +17,8 @@ class RecorderConfig(BaseModel):
 
     folder: Path = Path("recordings")
     """Where the files lie, one or more a run; a unit sets it to its state directory."""
+    mcap: bool = True
+    """False: nothing is recorded, only the missions' reports are written."""
     frames: Literal["compressed", "raw", "off"] = "compressed"
     """Camera frames: colour as JPEG and depth lossless, as the sensor gave them (23 MB/s at 15 Hz), or none."""
     depth: DepthEncoding = "zstd"

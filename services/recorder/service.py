@@ -12,7 +12,19 @@ from pathlib import Path
 from schemas.camera import RgbdFrame
 from schemas.codec import Wire, encode
 from schemas.health import Health
-from schemas.topics import CAMERA_COMPRESSED, CAMERA_RGBD, TOPICS, Delivery, Topic
+from schemas.topics import (
+    CAMERA_COMPRESSED,
+    CAMERA_RGBD,
+    HEALTH,
+    MAP_CLOUD,
+    MISSION_STATE,
+    SLAM_POSE,
+    TOPICS,
+    TREES_LIST,
+    TREES_TARGET,
+    Delivery,
+    Topic,
+)
 from services.common.context import Context
 from services.common.errors import InputError
 from services.common.files import make_folder, write_whole
@@ -40,7 +52,7 @@ def build(context: Context) -> RecorderService:
     config = context.config.recorder
     make_folder(config.folder)
     warm()
-    for mended in recover_folder(config.folder):
+    for mended in recover_folder(config.folder) if config.mcap else ():
         LOG.info("%s", mended)
     service = RecorderService(context, config)
     for topic in recorded_topics(config):
@@ -52,7 +64,9 @@ def build(context: Context) -> RecorderService:
 
 
 def recorded_topics(config: RecorderConfig) -> list[Topic]:
-    """Return what goes into the file."""
+    """Return what goes into the file, or what a report is made from."""
+    if not config.mcap:
+        return [SLAM_POSE, MAP_CLOUD, TREES_LIST, TREES_TARGET, MISSION_STATE, HEALTH]
     frames = {"compressed": CAMERA_COMPRESSED, "raw": CAMERA_RGBD}.get(config.frames)
     left_out = {CAMERA_RGBD, CAMERA_COMPRESSED} - {frames}
     return [t for t in TOPICS if t.recorded and t.delivery is not Delivery.QUERY and t not in left_out]
@@ -68,31 +82,34 @@ class RecorderService:
         self._translator = Translator(context.uav, config.foxglove_image_hz) if config.foxglove else None
         limits = Limits(config.flush_s, config.file_mb * _MB, config.queue_mb * _MB, config.reserve_mb * _MB)
         self._begun = dt.datetime.now(dt.UTC)
-        self.drain = Drain(self._open_file, limits, lambda: _free_bytes(config.folder))
+        self.drain = Drain(self._open_file, limits, lambda: _free_bytes(config.folder)) if config.mcap else None
         self._told: dict[str, int] = {}
         self._chronicle = Chronicle(context.uav)
         self._reports, self._reported = 0, False
 
     def take(self, topic: Topic, message: Wire) -> None:
-        """Queue one message, and what Foxglove shows of it."""
+        """Queue one message, and what Foxglove shows of it; write the report when a mission has ended with it."""
         with self._context.health.timed("take"):
-            stamp_ns = self._context.clock.now_ns()
-            heavy = isinstance(message, RgbdFrame)
-            key = topic.key(self._context.uav, message.service if isinstance(message, Health) else None)
-            data = bytes(encode(message))
-            seq = getattr(message, "seq", 0)
-            self.drain.put(
-                Entry(key, getattr(topic.message, "SCHEMA", topic.name), topic.encoding, data, stamp_ns, seq, heavy)
-            )
+            if self.drain is not None:
+                self._queue(self.drain, topic, message)
             ended = self._chronicle.hear(message)
-            if self._translator is not None:
-                for name, shown in self._translator.translate(message):
-                    self.drain.put(Entry(name, "", "", shown, stamp_ns, 0, heavy))
         if ended:
             self._report()
 
+    def _queue(self, drain: Drain, topic: Topic, message: Wire) -> None:
+        stamp_ns = self._context.clock.now_ns()
+        heavy = isinstance(message, RgbdFrame)
+        key = topic.key(self._context.uav, message.service if isinstance(message, Health) else None)
+        schema, seq = getattr(topic.message, "SCHEMA", topic.name), getattr(message, "seq", 0)
+        drain.put(Entry(key, schema, topic.encoding, bytes(encode(message)), stamp_ns, seq, heavy))
+        if self._translator is not None:
+            for name, shown in self._translator.translate(message):
+                drain.put(Entry(name, "", "", shown, stamp_ns, 0, heavy))
+
     def tell(self) -> None:
         """Bring the drain's counters and its trouble into health."""
+        if self.drain is None:
+            return
         health = self._context.health
         for name, value in sorted(self.drain.counters.items()):
             health.count(name, value - self._told.get(name, 0))
@@ -103,7 +120,8 @@ class RecorderService:
         """Complete the file; tell of a mission that had not ended."""
         if self._chronicle.told and not self._reported:
             self._report()
-        self.drain.close()
+        if self.drain is not None:
+            self.drain.close()
 
     def _report(self) -> None:
         """Write the mission's report.html beside the recording; a disk that refuses costs the report alone."""

@@ -53,8 +53,8 @@ MISSION = (
 )
 
 
-def recorded(folder: Path, states: tuple[MissionState, ...]) -> list[Path]:
-    hub = Hub(TreedockConfig(recorder=RecorderConfig(folder=folder, reserve_mb=0)))
+def recorded(folder: Path, states: tuple[MissionState, ...], *, mcap: bool = True) -> list[Path]:
+    hub = Hub(TreedockConfig(recorder=RecorderConfig(folder=folder, reserve_mb=0, mcap=mcap)))
     service = build(cast("Context", hub.context("recorder")))
     other = hub.context("navigator")
     other.publish(TREES_LIST, example(TreeList))
@@ -65,7 +65,7 @@ def recorded(folder: Path, states: tuple[MissionState, ...]) -> list[Path]:
             other.publish(MISSION_STATE, told)
         hub.run()
     hub.stop()
-    assert service.drain.trouble == ""
+    assert service.drain is None or service.drain.trouble == ""
     return sorted(folder.glob("*report*.html"))
 
 
@@ -83,6 +83,12 @@ def test_two_missions_are_two_reports_and_a_broken_one_is_told_at_the_stop(tmp_p
     (path,) = recorded(tmp_path / "broken", MISSION[:2])
     assert "1.5 m reached" in path.read_text()
     assert recorded(tmp_path / "none", (state("idle", "waiting"),)) == []
+
+
+def test_reports_alone_need_no_recording(tmp_path: Path) -> None:
+    (path,) = recorded(tmp_path, MISSION, mcap=False)
+    assert "0.95 m for 3 s" in path.read_text()
+    assert list(tmp_path.glob("*.mcap")) == []
 
 
 def test_hostile_words_stay_words() -> None:

@@ -66,6 +66,7 @@ def recorded(folder: Path, frames: int = 12) -> Path:
             other.publish(topic, message)
         hub.run()
     hub.stop()
+    assert service.drain is not None
     assert service.drain.trouble == ""
     return next(folder.glob("*.mcap"))
 
