@@ -160,7 +160,7 @@ def run_turn(seed: int, turn: Turn, config: SlamConfig) -> dict[str, Any]:
     placed = [T for _, T in final]
     rotation = np.degrees(np.linalg.norm(pose_errors(placed, true, mean_alignment(placed, true))[:, 3:], axis=1))
     loops = [k for k, h in enumerate(heard) if h.result.graph is not None and h.result.graph.reason == "loop"]
-    after = [i for i, k in enumerate(tracked) if loops and k >= loops[0]]
+    after = [i for i, k in enumerate(tracked) if not loops or k >= loops[0]]  # no loop: the whole way counts
     return {
         "seed": seed,
         "frames": len(turn),
@@ -181,8 +181,6 @@ def run_turn(seed: int, turn: Turn, config: SlamConfig) -> dict[str, Any]:
 
 def _after_loop(online: Sequence[F64], true: Sequence[F64], after: Sequence[int]) -> float:
     """Return the largest rotation error (degrees) of the poses as published since the loop closed."""
-    if not after:
-        return float("nan")
     mine, truth = [online[i] for i in after], [true[i] for i in after]
     errors = pose_errors(mine, truth, mean_alignment(mine, truth))
     return float(np.degrees(np.linalg.norm(errors[:, 3:], axis=1).max()))
