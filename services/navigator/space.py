@@ -32,6 +32,7 @@ _HIT, _MISS, _FULL, _OCCUPIED = 2, 1, 12, 5
 _NOTED_M = 4.5
 """Surfaces farther away are too vague to be kept."""
 _BODY_M = 0.45
+_LEAST_HALF_M, _VIEW_SLOPE = 0.20, 0.6
 _LEAST_CELLS = 2
 _SKIN_M = 0.08
 
@@ -125,10 +126,12 @@ class Space:
             return 0.0
         ahead = way / length
         steps = np.arange(0.0, length + 1e-9, 0.5 * CELL_M)
-        sides = np.linspace(-half_width_m, half_width_m, 5)
+        # near the camera no wider than its view: beside it nothing can be seen from where it stands
+        width = np.minimum(half_width_m, np.maximum(_LEAST_HALF_M, _VIEW_SLOPE * steps))
+        sides = width[:, None] * np.linspace(-1.0, 1.0, 5)
         aside = np.array([-ahead[1], ahead[0]])
-        places = from_m + steps[:, None, None] * ahead + sides[None, :, None] * aside
-        known = self._known(places.reshape(-1, 2)).reshape(len(steps), len(sides)).all(axis=1)
+        places = from_m + steps[:, None, None] * ahead + sides[..., None] * aside
+        known = self._known(places.reshape(-1, 2)).reshape(sides.shape).all(axis=1)
         return length if known.all() else float(steps[int(np.argmin(known))])
 
     def _known(self, places_m: Matrix) -> Mask:

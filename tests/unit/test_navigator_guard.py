@@ -319,3 +319,14 @@ def test_it_gives_way_to_somebody_who_comes_too_near() -> None:
     world.run(seconds=1.5)
     assert np.hypot(*(world.position_m[:2] - world.walkers[0])) > np.hypot(*(place - world.walkers[0])) + 0.1
     assert np.hypot(*(world.position_m[:2] - begin)) < 1.5
+
+
+def test_a_view_along_the_way_makes_it_known_right_before_the_camera() -> None:
+    """Between where the aircraft stands and where its view is wide enough no gap is left (missions, seed 3015)."""
+    space, here = Space(), np.array([3.0, -2.0])
+    space.visit(here)
+    _looked(space, [], (3.0, -2.0), -1.2)
+    ahead = here + 0.9 * np.array([np.cos(-1.2), np.sin(-1.2)])
+    assert space.known_ahead_m(here, ahead, 0.35) == pytest.approx(0.9)
+    aside = here + 0.9 * np.array([np.cos(0.4), np.sin(0.4)])
+    assert space.known_ahead_m(here, aside, 0.35) < 0.9
