@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from services.camera.sources.associate import associate
 from services.camera.sources.text import read_rows, stamp_ns_of
-from services.camera.sources.tum import associate
 from services.common.errors import InputError
 from services.common.geometry import Matrix, log_rotation, pose, rotation_from_quaternion
 

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from schemas.navigation import MissionState
+from schemas.navigation import MissionState, MissionStateName
 from services.cli import run as run_module
 from services.cli import scratch
 from services.cli.mission import Conductor, Flown, prepared
@@ -55,11 +55,11 @@ def test_a_run_of_three_trees_is_done_with_three_docks_only() -> None:
     assert not mission_figures(flown, 3)["docked"]
 
 
-def _state(name: str, since_ns: int, docked: int) -> MissionState:
+def _state(name: MissionStateName, since_ns: int, docked: int) -> MissionState:
     return MissionState(
         stamp_ns=since_ns, seq=since_ns, map_id="m", state=name, previous="idle", since_ns=since_ns, reason="r",
         target_tree_id=None, visited_tree_ids=(), docked_count=docked, distance_m=None, heading_error_rad=None,
-    )  # type: ignore[arg-type]  # fmt: skip
+    )  # fmt: skip
 
 
 def test_folders_of_killed_runs_are_cleared_away_and_no_others(tmp_path: Path) -> None:

@@ -2,25 +2,29 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from services.detector import incremental
 from services.detector.config import DetectorConfig
+from services.detector.detect import detect_trees
 from services.detector.incremental import Incremental, cells_of
 from services.detector.model import DetectionResult, Views
-from tests.unit.detector_clouds import Floats, facing, ground, trunk
+from tests.unit.detector_clouds import facing, ground, trunk
 from tests.unit.test_detector_service import EYE, _moved, _submap, _System
+
+Points = NDArray[np.float32]
 
 PLACES = ((-3.0, -3.0), (-3.0, 3.0), (3.0, -3.0), (3.0, 3.0))
 
 
-def _map(places: tuple[tuple[float, float], ...]) -> Floats:
+def _map(places: tuple[tuple[float, float], ...]) -> Points:
     rng = np.random.default_rng(3)
     return np.concatenate([ground(7.0), *(trunk(x, y, 0.12, rng, arc=facing(x, y)) for x, y in places)]).astype(
         np.float32
     )
 
 
-def _views(cloud: Floats) -> Views:
+def _views(cloud: Points) -> Views:
     return Views(np.zeros(len(cloud), dtype=np.int32), np.array([[0.0, 0.0, 1.5]]))
 
 
@@ -30,9 +34,9 @@ def _places(result: DetectionResult) -> list[tuple[int, int]]:
 
 def test_only_touched_cells_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[int] = []
-    real = incremental.detect_trees
+    real = detect_trees
 
-    def counted(points: Floats, *rest: object) -> DetectionResult:
+    def counted(points: Points, *rest: object) -> DetectionResult:
         seen.append(len(points))
         return real(points, *rest)  # type: ignore[arg-type]
 
@@ -47,10 +51,10 @@ def test_only_touched_cells_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> No
     touched = cells_of(trunk(-3.0, -3.0, 0.12, rng)) | cells_of(trunk(2.0, 2.0, 0.12, rng))
     assert _places(detector.update(after, _views(after), touched)) == [(-3, 3), (2, 2), (3, -3)]
     assert seen[1] < 0.5 * seen[0]
-    assert detector.partial
+    assert bool(detector.partial)
     kept = {t.base_m for t in detector.result.trunks} if detector.result else set()
     assert _places(detector.whole(after, _views(after))) == [(-3, 3), (2, 2), (3, -3)]
-    assert not detector.partial
+    assert not bool(detector.partial)
     assert detector.result is not None
     for t in detector.result.trunks:
         assert min(np.hypot(t.base_m[0] - k[0], t.base_m[1] - k[1]) for k in kept) < 0.01
@@ -66,7 +70,7 @@ def test_a_change_nearly_everywhere_is_a_look_at_the_whole() -> None:
 
 def test_ids_live_through_parts_and_a_map_correction() -> None:
     system = _System()
-    near, far = _map(PLACES[:2]), _map(PLACES[2:])
+    near, far = (_map(places).astype(np.float64) for places in (PLACES[:2], PLACES[2:]))
     system.send(_submap(near[near[:, 0] < 0.0], 1), _submap(far[far[:, 0] > 0.0], 2))
     names = {t.id: (round(t.x_m), round(t.y_m)) for t in system.lists[-1].trees}
     assert sorted(names.values()) == sorted((round(x), round(y)) for x, y in PLACES)

@@ -14,7 +14,7 @@ from schemas.simulation import SimTruth, TrueTree
 from schemas.slam import Pose
 from schemas.trees import Target
 from services.cli.mission import flies, prepared
-from services.cli.run import services_for
+from services.cli.run_plan import services_for
 from services.cli.summary import mission_lines
 from services.common.config import TreedockConfig
 from services.common.errors import InputError

@@ -9,18 +9,17 @@ import numpy as np
 import pytest
 
 from services.common.errors import GoalNotReachedError
-from services.evaluate import bench_peers
 from services.evaluate.bench import BenchOptions
 from services.evaluate.bench_peers import PeerCloud, environment, with_sheet
 
 
 def test_without_an_environment_it_is_not_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(bench_peers.venv, "create", lambda folder, **_: Path(folder).mkdir(parents=True))
+    monkeypatch.setattr("venv.create", lambda folder, **_: Path(folder).mkdir(parents=True))
     said = subprocess.CompletedProcess(
         [], 1, "", "WARNING: slow\nERROR: No matching distribution found for dendromatics\n"
     )
-    monkeypatch.setattr(bench_peers.subprocess, "run", lambda *_, **__: said)
+    monkeypatch.setattr("subprocess.run", lambda *_, **__: said)
     with pytest.raises(GoalNotReachedError, match=r"not measured: pip cannot install .*No matching distribution"):
         environment(BenchOptions(out=tmp_path))
     assert not list(tmp_path.rglob("complete")), "the next call tries again"

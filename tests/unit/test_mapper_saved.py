@@ -206,7 +206,7 @@ def test_off_line_nothing_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_a_run_keeps_its_map_in_its_own_folder_and_begins_without_one(tmp_path: Path) -> None:
-    from services.cli.run import with_state
+    from services.cli.run_plan import with_state
 
     folder = tmp_path / "state"
     folder.mkdir()

@@ -21,8 +21,9 @@ def test_a_turn_on_the_spot_finds_people_and_no_phantoms(seed: int, people: int)
     T_world_map = map_frame(stage.path.at(0.0))
     T_map_world = inverse(T_world_map)
 
-    def place(p: np.ndarray) -> np.ndarray:
-        return np.asarray((T_map_world @ np.array([*p, 1.0]))[:2])
+    def place(p: np.ndarray) -> tuple[float, float]:
+        x_m, y_m, *_ = T_map_world @ np.array([*p, 1.0])
+        return float(x_m), float(y_m)
 
     known = [Disc(*place(t.centre_at(1.5)), t.radius_m + 0.3) for t in stage.scene.trees]
     for n in range(36):

@@ -49,11 +49,9 @@ class _Leaning(Rig):
         lean = self.stiffness * (np.array(self.goal) - track.predict(self.now_ns)[:3, 3])
         against = -self.stiffness * track.velocity_m_s
         lean[2] = against[2] = 0.0
-        position = np.array(self.goal) + np.clip(lean, -0.15, 0.15)
-        s = Setpoint(
-            position_m=tuple(float(v) for v in position), yaw_rad=0.0,
-            velocity_m_s=tuple(float(v) for v in np.clip(against, -0.15, 0.15)), yaw_rate_rad_s=0.0,
-        )  # type: ignore[arg-type]  # fmt: skip
+        x, y, z = (float(v) for v in np.array(self.goal) + np.clip(lean, -0.15, 0.15))
+        vx, vy, vz = (float(v) for v in np.clip(against, -0.15, 0.15))
+        s = Setpoint(position_m=(x, y, z), yaw_rad=0.0, velocity_m_s=(vx, vy, vz), yaw_rate_rad_s=0.0)
         return g.model_copy(update={"setpoint": s})
 
 

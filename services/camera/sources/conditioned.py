@@ -27,6 +27,7 @@ class ConditionedSource:
         self.name = source.name
         self.expected = source.expected
         self.paced = source.paced
+        self.remark = source.remark
 
     def __iter__(self) -> Iterator[RgbdFrame | BadFrame]:
         """Yield the source's frames, conditioned."""
