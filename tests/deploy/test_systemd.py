@@ -19,12 +19,13 @@ import units  # noqa: E402 - lies beside the installer
 REASON = missing()
 pytestmark = pytest.mark.skipif(bool(REASON), reason=REASON)
 
-# the checkout's environment lies in root's home on a developer's machine: the units' own user cannot read it
+# the checkout and its Python lie where the units' own user may not look: in root's home, or below /tmp
 _HERE = """\
 [Service]
 User=root
 Group=root
 ProtectHome=no
+PrivateTmp=no
 CapabilityBoundingSet=CAP_DAC_OVERRIDE
 Environment=NUMBA_CACHE_DIR={cache}
 """
@@ -46,7 +47,8 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
     config.parent.mkdir()
     config.write_text('config_version = 1\nuav = "kea"\n')
     try:
-        machine.boot()
+        if not machine.boot():
+            pytest.skip(f"systemd does not come up in a namespace here: {machine.boot_log()[-300:]}")
         for name in NAMES:
             done = machine.run("systemctl", "start", f"treedock-{name}", timeout_s=120.0)
             assert done.returncode == 0, done.stderr + machine.journal(f"treedock-{name}")
