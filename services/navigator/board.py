@@ -143,6 +143,12 @@ class Board:
         return line_clearance_m(here.position_m[:2], self.axis_m, self.discs(_HIDING_MARGIN_M)) < 0.0
 
     @property
+    def refiner_silent(self) -> bool:
+        """Whether the refiner says nothing at all; alive, it speaks of every frame, whether it sees the target or not."""
+        seen = self.inputs.target
+        return seen is None or self.inputs.age_s(seen) > self.config.failsafe.target_lost_s
+
+    @property
     def target_lost(self) -> bool:
         """Whether the target has been out of sight for longer than single missed frames last."""
         if self.target_seen_ns is None:

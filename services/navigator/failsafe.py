@@ -192,11 +192,12 @@ def _services(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
 
 def _target(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
     del w
-    if doing not in _VISUAL or b.axis_m is None or not b.target_lost or b.looking:
+    if doing not in _VISUAL or b.axis_m is None or not b.target_lost:
         return None
     seen = b.to_axis()
-    if doing == "approach" and (b.hidden or (seen is not None and seen[0] > b.config.visual_range_m)):
-        return None
+    far = seen is not None and seen[0] > b.config.visual_range_m
+    if not b.refiner_silent and (b.looking or (doing == "approach" and (b.hidden or far))):
+        return None  # out of sight on purpose: the camera looks where it flies, or the map will do for now
     return Fault("target lost", "hold", "the target is out of sight", b.config.failsafe.target_hold_s)
 
 

@@ -85,7 +85,16 @@ def test_a_recording_runs_to_its_end_although_a_service_was_killed(recording: Pa
     assert values["restarts"] == {"mapper": 1}
     assert values["frames"] == FRAMES
     assert values["trees"] == []
-    assert set(values["services"]) == {"router", "camera", "slam", "mapper", "detector", "refiner"}
+    assert set(values["services"]) == {
+        "router",
+        "station",
+        "preview",
+        "camera",
+        "slam",
+        "mapper",
+        "detector",
+        "refiner",
+    }
     assert values["duration_s"] <= time.monotonic() - begin_s
     assert not any(psutil.pid_exists(pid) and "services" in str(psutil.Process(pid).cmdline()) for pid in pids.values())
 

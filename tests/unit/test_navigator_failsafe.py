@@ -357,3 +357,19 @@ def test_choose_and_next() -> None:
     world.run(seconds=STEP_S)
     assert world.run("docked", 120.0) == "docked"
     assert world.mission.board.visited_ids == [other, first]
+
+
+def test_a_dead_refiner_stops_it_also_while_the_camera_looks_where_it_flies() -> None:
+    """On the way around a trunk the target is out of sight on purpose; that must not hide that nobody looks for it."""
+    world = World(trees=[tree(1, 4.5, 0.0), tree(5, 2.4, 0.0, 0.25, suitable=False)])
+    world.start()
+    assert world.run("approach") == "approach"
+    for _ in range(400):
+        world.step()
+        if world.mission.board.looking and world.state == "approach":
+            break
+    assert world.mission.board.looking, "this scene is to have a detour"
+    world.refiner_alive = False
+    begun_ns = world.now_ns
+    assert world.run("hold", 3.0) == "hold"
+    assert (world.now_ns - begun_ns) * 1e-9 < 0.65
