@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from schemas.topics import TREES_TARGET
 from tests.mission.flights import flight
 
 
@@ -36,4 +37,4 @@ def test_a_rendered_mission_docks_although_the_refiner_is_killed_on_the_way(tmp_
     assert abs(dock["distance_m"] - dock["true_distance_m"]) < 0.05
     assert values["truth"]["false"] == 0
     # nothing was lost on the way but the dead refiner's answers
-    assert set(values["dropped"]) <= {"navigator", "simulator"}, values["dropped"]
+    assert set(values["dropped"]) <= {*TREES_TARGET.consumers, "recorder"}, values["dropped"]
