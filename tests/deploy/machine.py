@@ -48,6 +48,9 @@ class Machine:
         for name in ("root", "upper", "work", "add"):
             (folder / name).mkdir()
         self.add = folder / "add"
+        # an empty file in place of the system's: booting would empty /tmp, where the checkout may lie
+        (self.add / "etc/tmpfiles.d").mkdir(parents=True)
+        (self.add / "etc/tmpfiles.d/tmp.conf").touch()
         self._process: subprocess.Popen[bytes] | None = None
         self._first = 0
 

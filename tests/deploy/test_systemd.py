@@ -44,7 +44,7 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
         extra.parent.mkdir()
         extra.write_text(_HERE.format(cache=Path.home() / ".cache/treedock/numba"))
     config = machine.add / "etc/treedock/10-treedock.toml"
-    config.parent.mkdir()
+    config.parent.mkdir(parents=True, exist_ok=True)
     config.write_text('config_version = 1\nuav = "kea"\n')
     try:
         if not machine.boot():
