@@ -6,7 +6,7 @@ import sqlite3
 import tempfile
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 
 import numpy as np
@@ -135,10 +135,9 @@ def _frame_rate(ground: Ground, seconds: float) -> float | None:
             browser.close()
             return float(fps)
     except ImportError:
-        page_without_browser = Page(ground)
-        while time.monotonic() < end_s:
-            page_without_browser.hear(2.0)
-        page_without_browser.close()
+        with closing(Page(ground)) as page_without_browser:
+            while time.monotonic() < end_s:
+                page_without_browser.hear(2.0)
         return None
 
 
@@ -148,14 +147,10 @@ def _right_after(ground: Ground, timeout_s: float = 20.0) -> float:
 
     begin_s = time.monotonic()
     while time.monotonic() - begin_s < timeout_s:
-        with suppress(OSError, TimeoutError, WebSocketException):
-            page = Page(ground)
-            try:
-                while not page.right(_AIRCRAFT, _TREES):
-                    page.hear(1.0)
-                return time.monotonic() - begin_s
-            finally:
-                page.close()
+        with suppress(OSError, TimeoutError, WebSocketException), closing(Page(ground)) as page:
+            while not page.right(_AIRCRAFT, _TREES):
+                page.hear(1.0)
+            return time.monotonic() - begin_s
         time.sleep(0.1)
     raise GoalNotReachedError(f"bench station: the page was not right within {timeout_s:g} s")
 

@@ -7,11 +7,15 @@ import signal
 import subprocess
 import sys
 import urllib.request
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from services.common.session import free_port
+
+if TYPE_CHECKING:
+    from websockets.sync.client import ClientConnection
 
 
 class Ground:
@@ -63,15 +67,32 @@ class Ground:
             self.kill(name)
 
 
+def page_socket(
+    address: str, *, origin: str | None = "its own", headers: Mapping[str, str] | None = None
+) -> ClientConnection:
+    """Return the WebSocket that the page at ``address`` would open; whoever opens it closes it.
+
+    It sends no pings of its own: the thread that does outlives a socket that was forgotten, and logs into what comes after.
+
+    Raises:
+        OSError, TimeoutError: nobody serves it.
+        websockets.WebSocketException: the station refuses.
+    """
+    from websockets.sync.client import connect
+    from websockets.typing import Origin
+
+    site = address.rstrip("/") if origin == "its own" else origin
+    return connect(
+        address.replace("http", "ws", 1) + "ws", origin=None if site is None else Origin(site), additional_headers=headers,
+        max_size=None, ping_interval=None, close_timeout=1.0, legacy=True,
+    )  # fmt: skip
+
+
 class Page:
     """A page without a browser: its WebSocket, and what it was told."""
 
     def __init__(self, ground: Ground) -> None:
-        from websockets.sync.client import connect
-        from websockets.typing import Origin
-
-        address, origin = ground.address.replace("http", "ws") + "ws", Origin(ground.address.rstrip("/"))
-        self._socket = connect(address, origin=origin, max_size=None, legacy=True)
+        self._socket = page_socket(ground.address)
         self._socket.send(json.dumps({"t": "hello", "secret": "b" * 24, "name": "bench"}))
         self.trees: dict[str, int] = {}
         self.links: dict[str, str] = {}

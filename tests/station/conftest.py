@@ -8,7 +8,9 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
+import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -35,6 +37,8 @@ class Ground:
     page_port: int = field(default_factory=free_port)
     running: dict[str, subprocess.Popen[bytes]] = field(default_factory=dict)
     settings: list[str] = field(default_factory=list)
+    on_end: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
+    """What a test opened towards the station and has closed, whatever becomes of it."""
 
     @property
     def address(self) -> str:
@@ -53,19 +57,23 @@ class Ground:
     def router(self) -> None:
         self._start("router", "services.cli.app", "router", "--port", str(self.port))
 
-    def station(self) -> None:
+    def station(self, *, answer: int = 200) -> None:
+        """Start it and wait until its page answers with this HTTP status."""
         settings = [f"station.inventory.database={self.database}", *self.settings]
         flags = [part for setting in settings for part in ("--set", setting)]
         port = ["--port", str(self.port), "--page-port", str(self.page_port)]
         self._start("station", "services.cli.app", "station", *port, *flags)
-        assert until(self._answers, 20.0), self.said("station")
+        assert until(lambda: self._answers() == answer, 20.0), self.said("station")
 
-    def _answers(self) -> bool:
+    def _answers(self) -> int | None:
         try:
             with urllib.request.urlopen(self.address, timeout=1.0) as answer:
-                return bool(answer.status == 200)
+                return int(answer.status)
+        except urllib.error.HTTPError as refusal:
+            with refusal:
+                return refusal.code
         except OSError:
-            return False
+            return None
 
     def aircraft(self, uav: str, speed: int = 4, seed: int = 1) -> None:
         self._start(uav, "tests.station.stub_aircraft", str(self.port), uav, str(speed), str(seed))
@@ -82,6 +90,7 @@ class Ground:
         return (self.folder / f"{name}.log").read_text()
 
     def end(self) -> None:
+        self.on_end.close()
         for process in self.running.values():
             if process.poll() is None:
                 process.send_signal(signal.SIGCONT)
@@ -108,6 +117,7 @@ def ground(tmp_path: Path) -> Iterator[Ground]:
         yield ground
     finally:
         ground.end()
+    assert not [t.name for t in threading.enumerate() if "(keepalive)" in t.name or "(recv_events)" in t.name]
 
 
 @pytest.fixture(scope="session")
