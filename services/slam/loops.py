@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -72,9 +72,10 @@ class Loops:
             self.places.keep_only({int(s) for s in kf.serial[kf.n > 0]})
             candidates = self._candidates(k, bag)
         for candidate in candidates:
+            turned = self.mapping.turned
             found = self._verify(k, candidate)
-            if found is not None:
-                return self.close(k, candidate, found)
+            if found is not None and self.mapping.turned is turned:  # else: found in which of the two maps?
+                return self.close(k, candidate, found, turned)
         return None
 
     def _candidates(self, k: int, bag: Bag) -> list[int]:
@@ -137,10 +138,10 @@ class Loops:
             located = self.tracking.join_keyframes(rough, group, _WINDOW_PX)
             return None if located is None else self.tracking.join_keyframes(located, group, 0.5 * _WINDOW_PX)
 
-    def close(self, k: int, candidate: int, found: Tracked) -> Correction | None:
+    def close(self, k: int, candidate: int, found: Tracked, turned: F64) -> Correction:
         """Correct the poses by a pose graph, join the points of both sides, then adjust everything.
 
-        None when the map was turned meanwhile: the next keyframe will see the loop again.
+        ``found`` is of when ``mapping.turned`` was ``turned``.
         """
         atlas, mapping = self.atlas, self.mapping
         with mapping.step():
@@ -150,32 +151,35 @@ class Loops:
             old_points = points_of(atlas.points, kf, group)
             own = np.concatenate([[k], neighbours(atlas, k, _COVISIBLE, 10)]).astype(np.int32)
             own = own[~np.isin(own, group)]
-        if not self._correct_poses(k, candidate, found):
-            return None
+        self._correct_poses(k, candidate, found, turned)
         with mapping.step():
             join_loop(atlas.points, atlas.keyframes, k, found.point, atlas.scales)
         for s in own:
             mapping.fuse_into(int(s), old_points)
         mapping.adjust_all(k)
+        mapping.pay(k)
         self.closed += 1
         return Correction(jump_m, jump_rad)
 
-    def _correct_poses(self, k: int, candidate: int, found: Tracked) -> bool:
+    def _correct_poses(self, k: int, candidate: int, found: Tracked, turned: F64) -> None:
         """Spread the loop's error over all keyframes; each point moves with the keyframe that saw it first."""
         atlas, mapping = self.atlas, self.mapping
         with mapping.step():
-            kf, turns, slots = atlas.keyframes, mapping.turns, atlas.slots
+            turn = mapping.turn_since(turned)
+            found_R = found.R if turn is None else found.R @ turn.T
+            turned = mapping.turned
+            kf, slots = atlas.keyframes, atlas.slots
             index = np.full(len(kf.n), -1, np.int32)
             index[slots] = np.arange(len(slots))
             R, t = kf.R[slots].copy(), kf.t[slots].copy()
             free = kf.serial[slots] != 0
-        edges = self._edges(slots, index, R, t, (k, candidate, found))
+        edges = self._edges(slots, index, R, t, (k, candidate, replace(found, R=found_R)))
         if free.all():
             free[0] = False
         optimise(R, t, edges, free)
         with mapping.step():
-            if turns != mapping.turns:
-                return False
+            turn = mapping.turn_since(turned)
+            R = R if turn is None else R @ turn.T
             slots, R, t = self._with_newer(slots, R, t)
             kf = atlas.keyframes
             index = np.full(len(kf.n), -1, np.int32)
@@ -184,7 +188,6 @@ class Loops:
             kf.R[slots], kf.t[slots] = R, t
             mapping.revision += 1
             self.closed += 1
-        return True
 
     def _with_newer(self, slots: I32, R: F64, t: F64) -> tuple[I32, F64, F64]:
         """Add the keyframes made while the graph was optimised: each moves with its best neighbour among ``slots``."""

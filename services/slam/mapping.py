@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.slam import GraphReason
-from services.common.geometry import inverse, pose
+from services.common.geometry import inverse, orthonormal, pose
 from services.slam.atlas import Atlas, neighbours
 from services.slam.bundle import Problem, adjust, adjust_large, build, chi_squares
 from services.slam.camera import CameraModel
@@ -43,7 +43,8 @@ class Part:
     slots: I32
     """The keyframes of the problem, the first ``free`` of them to be moved."""
     free: int
-    turns: int
+    turned: F64
+    """``Mapping.turned`` when the copy was made."""
 
 
 class Mapping:
@@ -62,7 +63,9 @@ class Mapping:
         self._owed = False
         """A large adjustment was cut short."""
         self.turns = 0
-        """Up by one whenever the whole map was turned: what was computed before is void."""
+        """Up by one whenever the whole map was turned."""
+        self.turned: F64 = np.eye(3)
+        """All its turns so far, (3, 3), one new array for each: what a job computed before a turn is turned after it."""
         self.retired: dict[int, tuple[int, F64]] = {}
         """Culled keyframes: serial -> (serial of its stand-in, T_standin_keyframe)."""
         self._recent = np.zeros((0, 2), np.int32)
@@ -96,6 +99,10 @@ class Mapping:
             self.far.learn(atlas.points, atlas.keyframes, self.camera.array[0])
         self._cull_keyframes(k)
         self._thin()
+        self.pay(k)
+
+    def pay(self, k: int) -> None:
+        """Do the large adjustment that was cut short, unless keyframes wait: then the next one asks again."""
         if self._owed and not self.hurried():
             self._owed = False
             self.adjust_all(k)
@@ -191,7 +198,7 @@ class Mapping:
         index = np.full(len(kf.n), -1, np.int32)
         index[slots] = np.arange(len(slots))
         problem = build(points, kf, ids, slots, index, self.camera.variance, self.far.disparity(self.camera.array[4]))
-        return Part(problem, ids, slots, len(free), self.turns)
+        return Part(problem, ids, slots, len(free), self.turned)
 
     def _adjust(self, part: Part | None, robust_iterations: int, iterations: int, why: GraphReason) -> None:
         """Adjust the copy, apply it, drop the observations that do not fit."""
@@ -208,16 +215,17 @@ class Mapping:
                     break
             gate(chi_squares(problem, camera), problem.info, 1.0, problem.use)
         with self.step():
-            if part.turns == self.turns:
-                self._apply(part)
-                self.why = why
+            self._apply(part)
+            self.why = why
 
     def _apply(self, part: Part) -> None:
         """Take over an adjustment. Its points and keyframes are still there: only mapping ends any."""
         points, kf, problem = self.atlas.points, self.atlas.keyframes, part.problem
         free = part.slots[: part.free]
-        kf.R[free], kf.t[free] = problem.R[: part.free], problem.t[: part.free]
-        points.pos[part.ids] = problem.X
+        turn = self.turn_since(part.turned)
+        R, X = problem.R[: part.free], problem.X
+        kf.R[free], kf.t[free] = R if turn is None else R @ turn.T, problem.t[: part.free]
+        points.pos[part.ids] = X if turn is None else X @ turn.T
         drop_outliers(points, kf, part.ids, part.slots, problem.start, problem.pose, problem.use)
         self.revision += 1
 
@@ -228,6 +236,11 @@ class Mapping:
         points.normal[:] = points.normal @ R.T
         kf.R[:] = kf.R @ R.T
         self.turns += 1
+        self.turned = orthonormal(R @ self.turned)
+
+    def turn_since(self, before: F64) -> F64 | None:
+        """Return what takes map points of when ``turned`` was ``before`` to now's, (3, 3); None when the map stands."""
+        return None if self.turned is before else self.turned @ before.T
 
     def _cull_keyframes(self, k: int) -> None:
         atlas = self.atlas

@@ -47,4 +47,4 @@ def _warm_loop(slam: Slam) -> None:
     slam.loops.relocate(features)
     found = slam.loops.place(features, int(slots[0]))
     if found is not None:
-        slam.loops.close(int(slots[-1]), int(slots[0]), found)
+        slam.loops.close(int(slots[-1]), int(slots[0]), found, slam.mapping.turned)

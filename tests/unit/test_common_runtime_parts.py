@@ -128,7 +128,8 @@ def test_a_repeated_record_comes_once_a_period(caplog: pytest.LogCaptureFixture)
     throttle.log(logger, logging.WARNING, "trees", "bad trees")
     time.sleep(0.06)
     throttle.log(logger, logging.WARNING, "pose", "bad pose")
-    assert [r.getMessage() for r in caplog.records] == ["bad pose", "bad trees", "bad pose (and 4 more like it)"]
+    said = [r.getMessage() for r in caplog.records if r.name == logger.name]
+    assert said == ["bad pose", "bad trees", "bad pose (and 4 more like it)"]
 
 
 @pytest.mark.parametrize("endpoint", ["", "tcp", "tcp/host", "tcp/host:0", "tcp/host:70000", "tcp/:1", "host:7447"])
