@@ -27,6 +27,7 @@ from services.common.errors import InputError
 from services.common.health import HealthReporter, State
 from services.common.inbox import Inbox
 from services.common.logging import Throttle, set_up
+from services.common.process import started
 from services.common.session import opened_node, shared_memory_note
 from services.common.stop import StopSignal
 
@@ -268,6 +269,7 @@ def _serve(context: LiveContext, build: Build, stop: StopSignal) -> int:
     context.every_wall(_HEALTH_PERIOD_NS * 1e-9, report)
     context.bus.declare_live(context.service)
     stop.when_set(context.inbox.wake)
+    started()
     sd_notify.notify("READY=1")
     LOG.info("ready")
     report()

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from services.common.numba_start import load_numba
+
 
 def warm() -> None:
     """Run every kernel on a small cloud, for both kinds of float, with and without views."""
+    load_numba()
     from services.detector.checks import warm_checks
     from services.detector.detect import detect_trees
     from services.detector.model import Views

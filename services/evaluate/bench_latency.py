@@ -9,15 +9,13 @@ dropped where a service is still busy, as from any camera.
 from __future__ import annotations
 
 import itertools
-import subprocess
-import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,6 +27,7 @@ from schemas.trees import Target
 from services.common.config import TreedockConfig
 from services.common.errors import InputError
 from services.evaluate.bench import BenchOptions, BenchReport, code_version
+from services.evaluate.processes import Processes
 
 if TYPE_CHECKING:
     from services.common.bus import Bus
@@ -165,7 +164,7 @@ def measure(frames: Sequence[RgbdFrame], rate_hz: float) -> Passages:
         "router": base.router.model_copy(update={"port": free_port(base.router.host)}),
     })  # fmt: skip
     seen = Passages()
-    with tempfile.TemporaryDirectory(prefix="treedock-latency-") as folder, _Processes(config, Path(folder)) as running:
+    with tempfile.TemporaryDirectory(prefix="treedock-latency-") as folder, Processes(config, Path(folder)) as running:
         running.start("router")
         with opened_client(config.router.endpoint, lambda: False, wait_s=60.0) as session:
             bus = Bus(session, config.uav, HealthBook())
@@ -175,13 +174,13 @@ def measure(frames: Sequence[RgbdFrame], rate_hz: float) -> Passages:
             bus.subscribe_keys(CAMERA_RGBD, seen.on_frame, at_once=True)
             for name in _SERVICES:
                 running.start(name)
-            _wait(running, lambda: all(bus.alive(name) for name in _SERVICES), _READY_WITHIN_S, "services to be ready")
+            running.wait(lambda: all(bus.alive(name) for name in _SERVICES), _READY_WITHIN_S, "services to be ready")
             _send(bus, frames, rate_hz, running, seen)
             time.sleep(_DRAIN_S)
     return seen
 
 
-def _send(bus: Bus, frames: Sequence[RgbdFrame], rate_hz: float, running: _Processes, seen: Passages) -> None:
+def _send(bus: Bus, frames: Sequence[RgbdFrame], rate_hz: float, running: Processes, seen: Passages) -> None:
     """Hand out the frames, each at its time."""
     begin_s = time.monotonic()
     for k, frame in enumerate(frames):
@@ -191,51 +190,6 @@ def _send(bus: Bus, frames: Sequence[RgbdFrame], rate_hz: float, running: _Proce
         seen.sent += 1
         if k % 15 == 0:
             running.check()
-
-
-class _Processes:
-    """The services' processes; all are gone at the end."""
-
-    def __init__(self, config: TreedockConfig, folder: Path) -> None:
-        self._folder = folder
-        self._config = folder / "config.json"
-        self._config.write_text(config.model_dump_json(), encoding="utf-8")
-        self._processes: dict[str, subprocess.Popen[bytes]] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def start(self, name: str) -> None:
-        """Start a service."""
-        command = [sys.executable, "-m", "services.cli.app", name, "--config", str(self._config)]
-        with (self._folder / f"{name}.log").open("wb") as log:
-            self._processes[name] = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
-
-    def check(self) -> None:
-        """Raise InputError with the last words of a service that ended."""
-        for name, process in self._processes.items():
-            if process.poll() is not None:
-                lines = (self._folder / f"{name}.log").read_text(errors="replace").strip().splitlines()
-                raise InputError(f"{name} ended with {process.returncode}: {lines[-1] if lines else 'it said nothing'}")
-
-    def __exit__(self, *_: object) -> None:
-        for name in reversed(self._processes):
-            process = self._processes[name]
-            process.terminate()
-            try:
-                process.wait(timeout=5.0)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-
-
-def _wait(running: _Processes, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
-    end_s = time.monotonic() + timeout_s
-    while not condition():
-        running.check()
-        if time.monotonic() > end_s:
-            raise InputError(f"waited {timeout_s:.0f} s for {what}")
-        time.sleep(0.1)
 
 
 def latencies_ms(seen: Passages) -> np.ndarray[Any, np.dtype[np.float64]]:

@@ -1,152 +1,191 @@
-"""The live slam service over a rendered walk, by itself in a process: times, cores, memory. Prints one JSON object.
+"""The live slam service over a rendered walk: a process on the bus, watched from outside, fed at a camera's rate.
 
-``python -m services.evaluate.slam_live WALK FRAMES RATE_HZ FOLDER``: frames come in real time (RATE_HZ 0: as fast as they are
-taken); those that come while the service works are dropped, as the bus does. Everything but Zenoh itself is in it: raw
-1.5 MB frames are decoded, keyframes compressed, the map kept on disk.
+This process is the camera: it publishes raw 1.5 MB frames at their time. A frame that comes while the service is still
+busy with one before is dropped, as from any camera.
 """
 
 from __future__ import annotations
 
-import json
-import os
-import sys
+import tempfile
 import time
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.camera import RgbdFrame
-from schemas.slam import Pose
-from schemas.topics import SLAM_POSE
+from schemas.slam import Graph, Keyframe, Pose
+from schemas.topics import CAMERA_RGBD, SLAM_GRAPH, SLAM_KEYFRAME, SLAM_POSE
 from services.common.config import TreedockConfig
+from services.common.errors import InputError
 from services.common.geometry import from_transform
-from services.common.memory import Hub, MemoryContext
-from services.common.process import prepare_process
+from services.evaluate.processes import Processes
 from services.evaluate.slam_walk import WalkFrame, read_walk
 
-LIMIT_S = 300.0
-"""Wall time after which the rest of a walk is left out: on a busy machine."""
-_START_NS = 10**9
+if TYPE_CHECKING:
+    from services.common.bus import Bus
+
+F64 = NDArray[np.float64]
+
+SERVICE = "slam"
+_FIRST_POSE_WITHIN_S = 240.0
+"""Kernels that are not compiled yet take minutes."""
+_LOOK_EVERY = 100
+_DRAIN_S = 1.0
 
 
 @dataclass(slots=True)
 class Live:
-    """What was measured; one entry per frame taken."""
+    """What was measured; lists of one entry per pose in order of arrival, unless said otherwise."""
 
+    index: list[int] = field(default_factory=list)
+    """The walk's frame."""
     track_ms: list[float] = field(default_factory=list)
-    """Wall time of the tracking call."""
-    whole_ms: list[float] = field(default_factory=list)
-    """With decoding and publishing."""
-    whole_cpu_ms: list[float] = field(default_factory=list)
-    """CPU time of that thread."""
+    """Wall time of the tracking call, as the pose tells it."""
+    latency_ms: list[float] = field(default_factory=list)
+    """From the frame's publishing to the pose's arrival."""
     error_m: list[float] = field(default_factory=list)
+    """Distance to the true position; of located frames."""
     alive: list[int] = field(default_factory=list)
     """Keyframes in the map, every hundredth frame."""
-    dropped: int = 0
+    cpu_s: list[float] = field(default_factory=list)
+    """CPU time since the walk's first frame, all threads, every hundredth frame."""
+    rss_mb: list[float] = field(default_factory=list)
+    """Memory held, every hundredth frame."""
+    sent: int = 0
     lost: int = 0
-    resets: int = 0
     keyframes: int = 0
     loops: int = 0
-    cores: float = 0.0
+    resets: int = 0
+    wall_s: float = 0.0
     first_pose_s: float = 0.0
-    """From the start of the process (interpreter, imports, kernels from the cache) to its first pose."""
-    rss_mb: float = 0.0
+    """From the start of the process (interpreter, imports, kernels from the cache, bus) to its first pose."""
+    peak_mb: float = 0.0
+
+    @property
+    def cores(self) -> float:
+        """CPU time of the service over wall time."""
+        return self.cpu_s[-1] / self.wall_s
+
+    @property
+    def dropped(self) -> int:
+        """Frames that were sent and not answered."""
+        return self.sent - len(self.index)
 
 
-class _RealTime(MemoryContext):
-    lockstep = False
+class _Watch:
+    """Notes what the service sends."""
+
+    def __init__(self, live: Live) -> None:
+        self._live = live
+        self.sent: dict[int, tuple[int, F64, float]] = {}
+        """Stamp to index, true pose and moment of sending."""
+        self.first_pose_s = 0.0
+        self.alive = 0
+
+    def on_pose(self, _: str, pose: Pose) -> None:
+        """Note a pose; those of the frames sent before the walk only tell that the service works."""
+        now_s = time.monotonic()
+        self.first_pose_s = self.first_pose_s or now_s
+        sent = self.sent.pop(pose.stamp_ns, None)
+        if sent is None:
+            return
+        live, (index, truth, sent_s) = self._live, sent
+        live.index.append(index)
+        live.track_ms.append(round(pose.processing_ms, 2))
+        live.latency_ms.append(round((now_s - sent_s) * 1e3, 2))
+        live.resets = pose.reset_counter
+        if pose.T_map_camera is None:
+            live.lost += 1
+        else:
+            off_m = float(np.linalg.norm(from_transform(pose.T_map_camera)[:3, 3] - truth[:3, 3]))
+            live.error_m.append(round(off_m, 4))
+
+    def on_keyframe(self, _: str, keyframe: Keyframe) -> None:
+        """Count a keyframe."""
+        del keyframe
+        self._live.keyframes += 1
+
+    def on_graph(self, _: str, graph: Graph) -> None:
+        """Note how large the map is."""
+        self.alive = len(graph.nodes)
+        self._live.loops += graph.reason == "loop"
 
 
-def run(walk: Path, frames: int, rate_hz: float, folder: Path) -> Live:
-    """Run the service over the walk's first ``frames``."""
-    import cv2
+def run_live(walk: Path, frames: int, rate_hz: float) -> Live:
+    """Run ``treedock slam`` over the walk's first ``frames``.
 
-    from services.slam.config import SlamConfig
-    from services.slam.maps import LiveMaps
-    from services.slam.service import SlamService
-    from services.slam.warm import warm
+    Raises:
+        InputError: the service ended, or gave no pose in time.
+    """
+    from services.common.bus import Bus
+    from services.common.context import HealthBook
+    from services.common.session import free_port, opened_client
 
-    cv2.setNumThreads(1)
-    warm()
-    hub = Hub(TreedockConfig())
-    context, config = _RealTime(hub, "slam"), SlamConfig()
-    maps = LiveMaps(config, folder, context.health)
-    service = SlamService(context, config, maps)
     live = Live()
-    poses: list[Pose] = []
-    hub.context("listener").on(SLAM_POSE, poses.append)
-    begin_s, cpu_s, feeding_s = time.perf_counter(), time.process_time(), 0.0
-    for item in read_walk(walk):
-        if item.index >= frames or time.perf_counter() - begin_s > LIMIT_S:
-            break
-        feed_s = time.thread_time()
-        frame = _message(item)
-        feeding_s += time.thread_time() - feed_s
-        if rate_hz > 0.0:
-            late_s = time.perf_counter() - begin_s - item.index / rate_hz
-            if late_s > 1.0 / rate_hz:
-                live.dropped += 1
-                continue
-            time.sleep(max(-late_s, 0.0))
-        _take(live, service, context, frame)
-        hub.run()
-        if not live.first_pose_s and poses:
-            live.first_pose_s = _age_s()
-        _judge(live, poses[-1], item)
-        if item.index % 100 == 0 and service.slam is not None:
-            live.alive.append(len(service.slam.atlas.slots))
-    wall_s = time.perf_counter() - begin_s
-    live.cores = (time.process_time() - cpu_s - feeding_s) / wall_s
-    live.resets = poses[-1].reset_counter
-    live.keyframes = context.health.counters["keyframes"]
-    if service.slam is not None:
-        live.loops = service.slam.loops.closed // 2
-    live.rss_mb = _peak_rss_mb()
-    maps.end()
+    watch = _Watch(live)
+    with tempfile.TemporaryDirectory(prefix="treedock-walk-") as folder:
+        base = TreedockConfig()
+        config = base.model_copy(update={
+            "slam": base.slam.model_copy(update={"map_folder": Path(folder) / "map"}),
+            "router": base.router.model_copy(update={"port": free_port(base.router.host)}),
+        })  # fmt: skip
+        with Processes(config, Path(folder)) as running:
+            running.start("router")
+            with opened_client(config.router.endpoint, lambda: False, wait_s=60.0) as session:
+                bus = Bus(session, config.uav, HealthBook())
+                bus.subscribe_keys(SLAM_POSE, watch.on_pose, at_once=True)
+                bus.subscribe_keys(SLAM_KEYFRAME, watch.on_keyframe, at_once=True)
+                bus.subscribe_keys(SLAM_GRAPH, watch.on_graph, at_once=True)
+                _walk(bus, running, watch, live, read_walk(walk), frames, rate_hz)
     return live
 
 
-def _take(live: Live, service: object, context: MemoryContext, frame: RgbdFrame) -> None:
-    whole_s, cpu_s = time.perf_counter(), time.thread_time()
-    service.on_frame(frame)  # type: ignore[attr-defined]  # imported late
-    live.whole_ms.append((time.perf_counter() - whole_s) * 1e3)
-    live.whole_cpu_ms.append((time.thread_time() - cpu_s) * 1e3)
-    live.track_ms.append(context.health.stage_ms["track"][-1])
-
-
-def _judge(live: Live, pose: Pose, item: WalkFrame) -> None:
-    if pose.T_map_camera is None:
-        live.lost += 1
-        return
-    live.error_m.append(float(np.linalg.norm(from_transform(pose.T_map_camera)[:3, 3] - item.T_map_camera[:3, 3])))
+def _walk(
+    bus: Bus, running: Processes, watch: _Watch, live: Live, walk: Iterator[WalkFrame], frames: int, rate_hz: float
+) -> None:
+    """Start slam before a standing camera; walk from its first pose on."""
+    first = next(walk)
+    standing, seq, begin_s = _message(first), 0, time.monotonic()
+    running.start(SERVICE)
+    while not watch.first_pose_s:
+        running.check()
+        if time.monotonic() - begin_s > _FIRST_POSE_WITHIN_S:
+            raise InputError(f"slam gave no pose within {_FIRST_POSE_WITHIN_S:.0f} s")
+        bus.publish(CAMERA_RGBD, replace(standing, stamp_ns=time.time_ns(), seq=seq))
+        seq += 1
+        time.sleep(1.0 / rate_hz)
+    live.first_pose_s = watch.first_pose_s - begin_s
+    cpu_s, begin_s = running.cpu_s(SERVICE), time.monotonic()
+    for item in walk:
+        if item.index >= frames:
+            break
+        frame = _message(item)
+        time.sleep(max(0.0, begin_s + live.sent / rate_hz - time.monotonic()))
+        stamp_ns = time.time_ns()
+        watch.sent[stamp_ns] = (item.index, item.T_map_camera, time.monotonic())
+        bus.publish(CAMERA_RGBD, replace(frame, stamp_ns=stamp_ns, seq=seq + live.sent))
+        live.sent += 1
+        if live.sent % _LOOK_EVERY == 0 or item.index == frames - 1:
+            running.check()
+            live.alive.append(watch.alive)
+            live.cpu_s.append(round(running.cpu_s(SERVICE) - cpu_s, 2))
+            live.rss_mb.append(round(running.memory_mb(SERVICE), 1))
+    live.wall_s = time.monotonic() - begin_s
+    time.sleep(_DRAIN_S)
+    live.peak_mb = running.memory_mb(SERVICE, peak=True)
 
 
 def _message(item: WalkFrame) -> RgbdFrame:
     from services.simulator.render import DEFAULT_INTRINSICS
 
-    up: NDArray[np.float64] = item.T_map_camera[:3, :3].T @ np.array([0.0, 0.0, 9.81])
+    up: F64 = item.T_map_camera[:3, :3].T @ np.array([0.0, 0.0, 9.81])
     raw = (item.depth_m * np.float32(1000.0) + np.float32(0.5)).astype(np.uint16)
     colour = np.repeat(item.grey[:, :, None], 3, axis=2)
     return RgbdFrame(
-        stamp_ns=_START_NS + item.index * 33_333_333, seq=item.index, intrinsics=DEFAULT_INTRINSICS,
-        colour=colour.tobytes(), depth=raw.tobytes(), accel_camera=(float(up[0]), float(up[1]), float(up[2])),
+        stamp_ns=1, seq=item.index, intrinsics=DEFAULT_INTRINSICS, colour=colour.tobytes(), depth=raw.tobytes(),
+        accel_camera=(float(up[0]), float(up[1]), float(up[2])),
     )  # fmt: skip
-
-
-def _age_s() -> float:
-    """Return how long this process has existed (proc(5), field 22 of stat)."""
-    ticks = int(Path("/proc/self/stat").read_text(encoding="ascii").rpartition(")")[2].split()[19])
-    return time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
-
-
-def _peak_rss_mb() -> float:
-    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    return next((int(line.split()[1]) / 1024.0 for line in lines if line.startswith("VmHWM")), 0.0)
-
-
-if __name__ == "__main__":
-    prepare_process()
-    path, count, rate, state = sys.argv[1:5]
-    sys.stdout.write(json.dumps(asdict(run(Path(path), int(count), float(rate), Path(state)))) + "\n")

@@ -27,6 +27,8 @@ _RADIUS_M = CIRCUIT_M / (2.0 * math.pi)
 _HALF_WIDTH_M = 9.0
 _FREE_M = 1.0
 _TREES = 260
+_HEAD_BYTES = 8 + 128
+"""Of a frame in the file: the sizes of its two images, its pose."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +76,7 @@ def walk_pose(scene: Scene, way_m: float) -> F64:
 
 
 def render_walk(path: Path, seed: int, frames: int, progress: Callable[[int], None] | None = None) -> None:
-    """Render the walk into ``path`` (about 60 KB a frame)."""
+    """Render the walk into ``path`` (about 60 KB a frame); what is there already of the same walk is gone on with."""
     import cv2
     from zstandard import ZstdCompressor
 
@@ -82,23 +84,42 @@ def render_walk(path: Path, seed: int, frames: int, progress: Callable[[int], No
     from services.simulator.sensor import RgbdSensor
     from services.simulator.world import World
 
+    done = trim_walk(path)
+    if done >= frames:
+        return
     scene = walk_scene(seed)
     small = halved(DEFAULT_INTRINSICS)
     renderer = Renderer(World(scene), small)
     sensor = RgbdSensor(SensorConfig(), (small.height, small.width), 1.0, seed)
     squeeze = ZstdCompressor(level=1)
     T_map_world = inverse(map_frame(walk_pose(scene, 0.0)))
-    with path.open("wb") as file:
-        for index in range(frames):
+    with path.open("ab") as file:
+        for index in range(done, frames):
             T = walk_pose(scene, LENGTH_M * index / frames)
             images = sensor.expose(renderer.render(T), index)
             grey = cv2.cvtColor(images.colour, cv2.COLOR_BGR2GRAY)
             jpeg = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
             depth = squeeze.compress(images.depth.tobytes())
-            file.write(np.array([len(jpeg), len(depth)], np.uint32).tobytes() + (T_map_world @ T).tobytes())
-            file.write(jpeg + depth)
+            sizes = np.array([len(jpeg), len(depth)], np.uint32).tobytes()
+            file.write(sizes + (T_map_world @ T).tobytes() + jpeg + depth)
             if progress is not None:
                 progress(index + 1)
+
+
+def trim_walk(path: Path) -> int:
+    """Cut off a half frame that an interrupted rendering left at the end; return how many whole ones there are."""
+    if not path.exists():
+        return 0
+    size, at, count = path.stat().st_size, 0, 0
+    with path.open("r+b") as file:
+        while len(head := file.read(_HEAD_BYTES)) == _HEAD_BYTES:
+            end = at + _HEAD_BYTES + int(np.frombuffer(head[:8], np.uint32).sum())
+            if end > size:
+                break
+            at, count = end, count + 1
+            file.seek(at)
+        file.truncate(at)
+    return count
 
 
 def read_walk(path: Path) -> Iterator[WalkFrame]:
@@ -109,7 +130,7 @@ def read_walk(path: Path) -> Iterator[WalkFrame]:
     expand = ZstdDecompressor()
     index = 0
     with path.open("rb") as file:
-        while head := file.read(8 + 128):
+        while head := file.read(_HEAD_BYTES):
             n_jpeg, n_depth = np.frombuffer(head[:8], np.uint32)
             small = np.asarray(cv2.imdecode(np.frombuffer(file.read(int(n_jpeg)), np.uint8), cv2.IMREAD_GRAYSCALE))
             raw = np.frombuffer(expand.decompress(file.read(int(n_depth))), np.uint16).reshape(small.shape)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from services.common.numba_start import load_numba
 from services.mapper.config import MapperConfig
 
 
 def warm() -> None:
     """Run every kernel on a tiny image."""
+    load_numba()
     from schemas.camera import Intrinsics
     from services.mapper.cloud import keyframe_cloud, pixel_rays
     from services.mapper.dense_map import DenseMap

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from schemas.camera import Intrinsics
+from services.common.numba_start import load_numba
+from services.slam.bundle import adjust_large
 from services.slam.config import SlamConfig
 from services.slam.keeper import rejoin, whole_map
 from services.slam.slam import Slam
@@ -17,6 +19,7 @@ def warm() -> None:
     global _done
     if _done:
         return
+    load_numba()
     rng = np.random.Generator(np.random.PCG64(1))
     coarse = rng.integers(0, 255, (60, 80), dtype=np.uint8)
     grey = np.kron(coarse, np.ones((4, 4), np.uint8))
@@ -28,9 +31,18 @@ def warm() -> None:
         slam.track(index, np.ascontiguousarray(np.roll(grey, shift, axis=1)), depth_m)
     _warm_loop(slam)
     _warm_keeping(slam)
+    _warm_large(slam)
     slam.polish()
+    slam.mapping.retire(int(slam.atlas.slots[1]))
     slam.final_trajectory()
     _done = True
+
+
+def _warm_large(slam: Slam) -> None:
+    """Adjust a copy of the map as a large one is."""
+    part = slam.mapping._about(slam.atlas.slots, 1)  # noqa: SLF001 - a map is large only after minutes
+    if part is not None:
+        adjust_large(part.problem, slam.camera.array, part.free, 1, robust=True)
 
 
 def _warm_keeping(slam: Slam) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from schemas.camera import Intrinsics
+from services.common.numba_start import load_numba
 from services.detector.refine import kernels_colour
 from services.detector.refine.agreement import ColourAgreement
 from services.detector.refine.config import RefinerConfig
@@ -17,6 +18,7 @@ _LEVEL = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0,
 
 def warm() -> None:
     """Run the refiner once on a small made-up trunk, and the filters once."""
+    load_numba()
     intrinsics = Intrinsics(width=64, height=48, fx=50.0, fy=50.0, cx=31.5, cy=23.5)
     depth = np.zeros((48, 64), np.float32)
     x = (np.arange(64) - 31.5) / 50.0
