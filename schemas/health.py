@@ -15,6 +15,7 @@ class Health(Message):
     """Health of one service."""
 
     SCHEMA: ClassVar[str] = "treedock.health"
+    VERSION: ClassVar[int] = 2
 
     service: Name
     stamp_ns: StampNs
@@ -30,3 +31,5 @@ class Health(Message):
     """Median duration of each stage over the last second."""
     note: Text = ""
     """What is wrong and what to do about it; empty when all is well."""
+    version: Text = ""
+    """Of the treedock that runs there (``services.common.version``): both ends must agree on messages and keys."""

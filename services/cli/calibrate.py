@@ -167,6 +167,8 @@ def _written(
     mount: Mounting | None,
 ) -> dict[str, Any]:  # fmt: skip
     """Write the camera (only one that passes) and the residual picture; return what --json shows."""
+    import datetime as dt
+
     import cv2
 
     from services.camera.calibration.picture import residual_picture
@@ -180,7 +182,7 @@ def _written(
     }  # fmt: skip
     if result.solution is None:
         return values
-    camera = camera_values(result.solution, board, depth_scale, mount)
+    camera = camera_values(result.solution, board, depth_scale, mount, day=dt.datetime.now(dt.UTC).date().isoformat())
     values |= {"reprojection_px": round(result.solution.rms_px, 4), "camera": camera}
     path = residuals or out.with_name(f"{out.stem}-residuals.png")
     picture = residual_picture(result, limits, f"{board.kind} {board.columns}x{board.rows}")

@@ -10,7 +10,7 @@ import typer
 from services.cli.options import AsJson, ConfigFile, Port, Settings, loaded
 
 if TYPE_CHECKING:
-    from services.doctor.findings import Facts, Finding
+    from services.doctor.model import Facts, Finding
 
 _MARKS = {"ok": ("ok  ", typer.colors.GREEN), "warn": ("warn", typer.colors.YELLOW),
           "fail": ("FAIL", typer.colors.RED), "unknown": ("?   ", typer.colors.WHITE)}  # fmt: skip

@@ -14,6 +14,7 @@ from schemas.envelope import MAX_TEXT
 from schemas.health import Health
 from schemas.topics import HEALTH
 from services.common.context import HealthBook
+from services.common.version import running_version
 
 State = Literal["starting", "ready", "degraded", "stopping"]
 
@@ -61,6 +62,7 @@ class HealthReporter:
             rates_hz=_labelled({name: round(rate, 2) for name, rate in rates.items()}, _MAX_RATES),
             work_ms=_labelled(self._medians_ms(), _MAX_RATES),
             note="; ".join(notes + [waiting] * bool(waiting))[:MAX_TEXT],
+            version=running_version(),
         )
         self._seq += 1
         return health

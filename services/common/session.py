@@ -98,8 +98,13 @@ def opened_node(
     """
     from services.security.transport import node_settings, pair_of
 
-    secured = node_settings(pair_of(config.security, config.uav, service))
-    return opened_client(config.router.endpoint, stopped, wait_s, secured)
+    settings = node_settings(pair_of(config.security, config.uav, service)) | memory_settings(config)
+    return opened_client(config.router.endpoint, stopped, wait_s, settings)
+
+
+def memory_settings(config: TreedockConfig) -> dict[str, object]:
+    """Return what switches Zenoh's shared memory on or off."""
+    return {"transport/shared_memory/enabled": config.router.shared_memory}
 
 
 @contextmanager

@@ -9,29 +9,37 @@ import shutil
 import stat
 import subprocess
 import time
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from schemas.health import Health
-from schemas.topics import HEALTH
+from schemas.topics import HEALTH, VEHICLE_STATE
+from schemas.vehicle import VehicleState
+from services.camera.sources.camera_json import calibrated_on
 from services.common.errors import InputError
-from services.doctor.findings import Facts, ServiceFact
+from services.common.version import running_version
+from services.doctor.model import Facts, ServiceFact, VehicleFact
 
 if TYPE_CHECKING:
     from services.common.config import TreedockConfig
 
+USB_DEVICES = Path("/sys/bus/usb/devices")
 _LISTEN_S = 1.6
 """Health comes once a second."""
 
 
 def gather(config: TreedockConfig) -> Facts:
     """Return what can be found out in about two seconds."""
-    router, services = _bus(config)
+    heard = _listen(config)
     folder = config.security.folder
+    camera, mbit = _camera(config.camera.source)
     return Facts(
-        router=router,
-        wanted_router=config.router.endpoint,
-        services=services,
+        router=None if heard.fault else config.router.endpoint,
+        router_fault=heard.fault,
+        services=_services(heard),
+        vehicle=None if heard.vehicle is None else _vehicle(heard.vehicle),
+        version=running_version(),
         units=_units(),
         certificates=_certificates(folder) if folder else {},
         loose_keys=_loose_keys(folder) if folder else (),
@@ -42,54 +50,85 @@ def gather(config: TreedockConfig) -> Facts:
         shm_free_bytes=_free(Path("/dev/shm")),
         disk_free_bytes=_free(_nearest(config.recorder.folder)),
         recordings_cut=_cut(config.recorder.folder),
-        camera=_camera(config.camera.source),
+        camera=camera,
+        camera_mbit=mbit,
         source=config.camera.source,
+        camera_file=config.camera.camera_file,
         calibration_days=_age_days(config.camera.camera_file),
     )
+
+
+def _vehicle(state: VehicleState) -> VehicleFact:
+    return VehicleFact(state.connected, state.note, state.battery_share)
 
 
 def _from_outside(host: str) -> bool:
     return host not in {"127.0.0.1", "::1", "[::1]", "localhost"}
 
 
-def _bus(config: TreedockConfig) -> tuple[str | None, list[ServiceFact]]:
+@dataclass
+class _Heard:
+    """What came over the bus in a while."""
+
+    fault: str = ""
+    health: dict[str, tuple[Health, float]] = field(default_factory=dict)
+    """The latest of each service, and when it came (monotonic seconds)."""
+    vehicle: VehicleState | None = None
+    live: frozenset[str] = frozenset()
+    unreadable: int = 0
+
+    def take_health(self, health: Health) -> None:
+        self.health[health.service] = (health, time.monotonic())
+
+    def take_vehicle(self, vehicle: VehicleState) -> None:
+        self.vehicle = vehicle
+
+
+def _listen(config: TreedockConfig) -> _Heard:
     from services.common.bus import Bus
     from services.common.context import HealthBook
     from services.common.session import opened_node
 
-    latest: dict[str, tuple[Health, float]] = {}
-
-    def take(health: Health) -> None:
-        latest[health.service] = (health, time.monotonic())
-
+    heard, book = _Heard(), HealthBook()
     try:
         with opened_node(config, None, lambda: False, wait_s=0.0) as session:
-            bus = Bus(session, config.uav, HealthBook())
-            bus.subscribe(HEALTH, take, "*")
+            bus = Bus(session, config.uav, book)
+            bus.subscribe(HEALTH, heard.take_health, "*")
+            bus.subscribe(VEHICLE_STATE, heard.take_vehicle)
             deadline = time.monotonic() + _LISTEN_S
             while (left_s := deadline - time.monotonic()) > 0:
                 bus.inbox.wait(left_s)
                 while (taken := bus.inbox.take()) is not None:
                     taken[0].handler(taken[1])
-            silent = sorted(set(bus.live_services()) - set(latest))
-    except InputError:
-        return None, []
-    found = [_service(health, heard_s) for _, (health, heard_s) in sorted(latest.items())]
-    found += [ServiceFact(name, "silent", 0, "", 99.0, {}) for name in silent]
-    return config.router.endpoint, found
+            heard.live = frozenset(bus.live_services())
+    except InputError as error:
+        heard.fault = str(error)
+    heard.unreadable = book.counters[f"decode_errors.{HEALTH.name}"]
+    return heard
+
+
+def _services(heard: _Heard) -> list[ServiceFact]:
+    """Return a fact per live service: from its health, else that it is silent, or that its health could not be read."""
+    found = [_service(health, heard_s) for _, (health, heard_s) in sorted(heard.health.items())]
+    state = "unreadable" if heard.unreadable else "silent"
+    found += [ServiceFact(name, state, 0, "", 99.0, {}) for name in sorted(heard.live - set(heard.health))]
+    return found
 
 
 def _service(health: Health, heard_s: float) -> ServiceFact:
     return ServiceFact(
         health.service, health.state, health.pid, health.note, time.monotonic() - heard_s, health.rates_hz,
-        _locked_bytes(health.pid), 1e-9 * health.stamp_ns - (time.time() - (time.monotonic() - heard_s)),
+        _locked_bytes(health), 1e-9 * health.stamp_ns - (time.time() - (time.monotonic() - heard_s)), health.version,
     )  # fmt: skip
 
 
-def _locked_bytes(pid: int) -> int | None:
-    """Return VmLck: what the limit says is not always what is in force."""
+def _locked_bytes(health: Health) -> int | None:
+    """Return VmLck of a service on this machine: what the limit says is not always what is in force."""
+    process = Path(f"/proc/{health.pid}")
     try:
-        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+        if health.service.encode() not in (process / "cmdline").read_bytes().split(b"\0"):
+            return None  # of another machine, whose number means somebody else here
+        lines = (process / "status").read_text().splitlines()
     except OSError:
         return None
     words = next((line.split() for line in lines if line.startswith("VmLck:")), None)
@@ -152,16 +191,21 @@ def _cut(folder: Path) -> list[str]:
     return [str(path) for path in cut_recordings(folder)] if folder.is_dir() else []
 
 
-def _camera(source: str) -> str | None:
+def _camera(source: str) -> tuple[str | None, float | None]:
+    """Return what is there for a source, and the speed of its USB link (Mbit/s) where it has one."""
     place = source.partition(":")[2]
     if place:
-        return source if Path(place).exists() else None
-    devices = sorted(Path("/dev").glob("video*"))
-    return f"{source}: {len(devices)} video devices" if devices else None
+        return (source if Path(place).exists() else None), None
+    for device in sorted(USB_DEVICES.glob("*/product")):
+        try:
+            product, speed = device.read_text().strip(), (device.parent / "speed").read_text()
+        except OSError:  # unplugged while we look
+            continue
+        if source in product.lower():
+            return product, float(speed)
+    return None, None
 
 
 def _age_days(camera_file: str) -> float | None:
-    try:
-        return (time.time() - Path(camera_file).stat().st_mtime) / 86400.0 if camera_file else None
-    except OSError:
-        return None
+    day = calibrated_on(Path(camera_file)) if camera_file else None
+    return None if day is None else float((dt.datetime.now(dt.UTC).date() - day).days)

@@ -2,76 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Literal
-
-from schemas.topics import TOPICS
-
-Level = Literal["ok", "warn", "fail", "unknown"]
+from services.doctor.aboard import aboard
+from services.doctor.model import Facts, Finding
 
 EXPIRY_WARN_DAYS = 30
 CALIBRATION_WARN_DAYS = 180
 _GB = 1_000_000_000
 DISK_WARN_BYTES, DISK_FAIL_BYTES = 5 * _GB, _GB // 2
 SHM_WARN_BYTES = 256_000_000
-_RATE_LOW = 0.7
-_CLOCK_WARN_S = 0.05
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One line of the doctor's report."""
-
-    about: str
-    level: Level
-    text: str
-    do: str = ""
-    """What to do about it; empty when nothing is to be done."""
-
-
-@dataclass(frozen=True, slots=True)
-class ServiceFact:
-    """A service as its latest health tells it."""
-
-    name: str
-    state: str
-    pid: int
-    note: str
-    age_s: float
-    rates_hz: Mapping[str, float]
-    locked_bytes: int | None = None
-    """VmLck of its process on this machine; None: another machine's, or unreadable."""
-    clock_offset_s: float | None = None
-    """Its stamps against this machine's clock; None: not told."""
-
-
-@dataclass(frozen=True, slots=True)
-class Facts:
-    """Everything the doctor looked at; None stands for what could not be found out."""
-
-    router: str | None = None
-    """The address that answered, None when none did."""
-    wanted_router: str = ""
-    services: Sequence[ServiceFact] = ()
-    units: Mapping[str, str] = field(default_factory=dict)
-    """Unit name to systemd's ActiveState; empty when none is installed."""
-    certificates: Mapping[str, float] = field(default_factory=dict)
-    """Identity to days of validity left."""
-    loose_keys: Sequence[str] = ()
-    """Private keys that others can read."""
-    encrypted: bool = False
-    reachable_from_outside: bool = False
-    clock_synchronised: bool | None = None
-    locked_limit_bytes: int | None = None
-    """RLIMIT_MEMLOCK of this session; -1: unlimited."""
-    shm_free_bytes: int | None = None
-    disk_free_bytes: int | None = None
-    recordings_cut: Sequence[str] = ()
-    camera: str | None = None
-    """What the configured source found, None when nothing."""
-    source: str = "sim"
-    calibration_days: float | None = None
+USB3_MBIT = 5000.0
 
 
 def judge(facts: Facts) -> list[Finding]:
@@ -84,7 +23,6 @@ def judge(facts: Facts) -> list[Finding]:
         *_memory(facts),
         *_disk(facts),
         *_camera(facts),
-        *_rates(facts),
     ]
 
 
@@ -104,19 +42,9 @@ def _units(f: Facts) -> list[Finding]:
 
 def _bus(f: Facts) -> list[Finding]:
     if f.router is None:
-        do = "systemctl status treedock-router, or `treedock run`; is router.host right?"
-        return [Finding("router", "fail", f"nobody answers at {f.wanted_router}", do)]
-    found = [Finding("router", "ok", f.router)]
-    for service in f.services:
-        if service.age_s > 5.0:
-            do = f"systemctl restart treedock-{service.name}"
-            found.append(Finding(service.name, "fail", f"silent for {service.age_s:.0f} s: hung or gone", do))
-        elif service.state == "degraded":
-            found.append(
-                Finding(service.name, "warn", service.note or "degraded", "see the note; treedock topic echo health")
-            )
-        else:
-            found.append(Finding(service.name, "ok", service.state))
+        do = "systemctl status treedock-router, or start `treedock run`; is router.host right?"
+        return [Finding("router", "fail", f.router_fault or f"nobody answers at {f.wanted_router}", do)]
+    found = [Finding("router", "ok", f.router), *aboard(f.services, f.vehicle, f.version)]
     if not f.services:
         found.append(Finding("services", "warn", "no service is up", "sudo systemctl start treedock.target"))
     return found
@@ -142,16 +70,13 @@ def _security(f: Facts) -> list[Finding]:
 
 
 def _clock(f: Facts) -> list[Finding]:
-    found = []
     if f.clock_synchronised is False:
         do = "install chrony; on the aircraft take the ground station's clock as server"
-        found.append(Finding("clock", "warn", "this machine's clock is not synchronised", do))
-    for service in f.services:
-        offset = service.clock_offset_s
-        if offset is not None and abs(offset) > _CLOCK_WARN_S:
-            words = f"{service.name}'s machine is {1e3 * offset:+.0f} ms off this one"
-            found.append(Finding("clock", "warn", words, "synchronise both machines with chrony"))
-    return found or [Finding("clock", "unknown" if f.clock_synchronised is None else "ok", "synchronised" if f.clock_synchronised else "no word from timedatectl")]  # fmt: skip
+        return [Finding("clock", "warn", "this machine's clock is not synchronised", do)]
+    if f.clock_synchronised is None:
+        do = "nothing here says whether the clock is right (no timedatectl): look at it yourself"
+        return [Finding("clock", "unknown", "no word from timedatectl", do)]
+    return [Finding("clock", "ok", "synchronised")]
 
 
 def _memory(f: Facts) -> list[Finding]:
@@ -191,28 +116,21 @@ def _disk(f: Facts) -> list[Finding]:
 
 def _camera(f: Facts) -> list[Finding]:
     if f.source == "sim":
-        return [Finding("camera", "ok", "simulated")]
+        return [Finding("camera", "ok", "simulated (camera.source = sim)")]
     if f.camera is None:
         do = "lsusb; another cable and port; udevadm control --reload; is the user in groups video and plugdev?"
         return [Finding("camera", "fail", f"{f.source}: not found", do)]
-    found = [Finding("camera", "ok", f.camera)]
-    if f.calibration_days is not None and f.calibration_days > CALIBRATION_WARN_DAYS:
-        words = f"calibrated {f.calibration_days:.0f} days ago"
-        found.append(Finding("calibration", "warn", words, "treedock calibrate IMAGES..."))
-    return found
+    if f.camera_mbit is not None and f.camera_mbit < USB3_MBIT:
+        words = f"{f.camera} on a slow USB link ({f.camera_mbit:.0f} Mbit/s): frames will be missing"
+        return [Finding("camera", "warn", words, "a USB 3 port and cable"), *_calibration(f)]
+    return [Finding("camera", "ok", f.camera), *_calibration(f)]
 
 
-def _rates(f: Facts) -> list[Finding]:
-    """Compare what each producer says it sends with the table."""
-    found = []
-    for service in f.services:
-        for topic in TOPICS:
-            if topic.producer != service.name or not topic.rate_hz or topic.timeout_s is None:
-                continue
-            rate = service.rates_hz.get(topic.name)
-            if rate is not None and rate < _RATE_LOW * topic.rate_hz:
-                words = f"{rate:.1f} Hz, {topic.rate_hz:g} expected"
-                found.append(
-                    Finding(topic.name, "warn", words, f"is the machine overloaded? treedock topic hz {topic.name}")
-                )
-    return found
+def _calibration(f: Facts) -> list[Finding]:
+    do = "treedock calibrate IMAGES... makes a new one (docs/calibration.md)"
+    if not f.camera_file:
+        return [Finding("calibration", "ok", "the source's own (camera.camera_file is not set)")]
+    if f.calibration_days is None:
+        return [Finding("calibration", "warn", f"{f.camera_file} does not say when it was made", do)]
+    words = f"{f.camera_file}, {f.calibration_days:.0f} days old"
+    return [Finding("calibration", "warn" if f.calibration_days > CALIBRATION_WARN_DAYS else "ok", words, do)]

@@ -13,14 +13,16 @@ from typing import Self
 from services.common.config import TreedockConfig
 from services.common.errors import InputError
 
+_LOOK_S = 0.02
+
 
 class Processes:
     """The services' processes; all are gone at the end."""
 
     def __init__(self, config: TreedockConfig, folder: Path) -> None:
         self._folder = folder
-        self._config = folder / "config.json"
-        self._config.write_text(config.model_dump_json(), encoding="utf-8")
+        self.config_file = folder / "config.json"
+        self.config_file.write_text(config.model_dump_json(), encoding="utf-8")
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def __enter__(self) -> Self:
@@ -28,9 +30,17 @@ class Processes:
 
     def start(self, name: str) -> None:
         """Start a service."""
-        command = [sys.executable, "-m", "services.cli.app", name, "--config", str(self._config)]
+        self.spawn(name, "services.cli.app", name, "--config", str(self.config_file))
+
+    def spawn(self, name: str, module: str, *arguments: str) -> None:
+        """Start ``python -m module arguments`` under a name."""
+        command = [sys.executable, "-m", module, *arguments]
         with (self._folder / f"{name}.log").open("wb") as log:
             self._processes[name] = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+
+    def pid(self, name: str) -> int:
+        """Return the number of a process."""
+        return self._processes[name].pid
 
     def check(self) -> None:
         """Raise InputError with the last words of a service that ended."""
@@ -40,14 +50,18 @@ class Processes:
                 raise InputError(f"{name} ended with {process.returncode}: {lines[-1] if lines else 'it said nothing'}")
 
     def __exit__(self, *_: object) -> None:
-        for name in reversed(self._processes):
-            process = self._processes[name]
-            process.terminate()
-            try:
-                process.wait(timeout=5.0)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+        for name in reversed(list(self._processes)):
+            self.stop(name)
+
+    def stop(self, name: str) -> None:
+        """Stop one process."""
+        process = self._processes.pop(name)
+        process.terminate()
+        try:
+            process.wait(timeout=5.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
 
     def wait(self, condition: Callable[[], bool], timeout_s: float, what: str) -> None:
         """Wait until ``condition``.
@@ -60,7 +74,7 @@ class Processes:
             self.check()
             if time.monotonic() > end_s:
                 raise InputError(f"waited {timeout_s:.0f} s for {what}")
-            time.sleep(0.1)
+            time.sleep(_LOOK_S)
 
     def cpu_s(self, name: str) -> float:
         """Return the CPU time that a service has used, all threads (proc(5): utime and stime of stat)."""

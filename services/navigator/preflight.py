@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from services.common.version import running_version
+from services.doctor.aboard import against_flight
+from services.doctor.model import VehicleFact
 from services.navigator.board import Board
 from services.navigator.config import NavigatorConfig
 
@@ -34,6 +37,8 @@ def missing(board: Board, config: NavigatorConfig) -> list[str]:
         for name in ("camera", "slam", "mapper", "detector", "refiner")
         if name in board.inputs.services and board.inputs.service_age_s(name) > silent
     ]
+    # what `treedock doctor` calls a failure of services or autopilot is one here
+    faults += against_flight(board.inputs.aboard, VehicleFact(v.connected, v.note, v.battery_share), running_version())
     if config.ground_required and board.inputs.service_age_s("station") > config.failsafe.ground_silent_s:
         faults.append("no ground station")
     return faults

@@ -28,6 +28,7 @@ from schemas.topics import (
 from schemas.trees import Target, TreeList
 from schemas.vehicle import VehicleState
 from services.common.context import Context
+from services.doctor.model import ServiceFact
 from services.navigator.commands import CommandDesk
 from services.navigator.config import NavigatorConfig
 from services.navigator.guard import View, look
@@ -58,6 +59,7 @@ class Navigator:
         self._vehicle: Seen[VehicleState] | None = None
         self._view: Seen[View] | None = None
         self._services: dict[str, int] = {}
+        self._aboard: dict[str, ServiceFact] = {}
         self._steps = self._states = 0
 
     def register(self, rate_hz: float) -> None:
@@ -79,7 +81,10 @@ class Navigator:
     def step(self) -> None:
         """Step the mission and publish what it says."""
         now_ns = self._context.clock.now_ns()
-        inputs = Inputs(now_ns, self._pose, self._trees, self._target, self._vehicle, dict(self._services), self._view)
+        inputs = Inputs(
+            now_ns, self._pose, self._trees, self._target, self._vehicle, dict(self._services), self._view,
+            tuple(self._aboard.values()),
+        )  # fmt: skip
         with self._context.health.timed("step"):
             outputs = self.mission.step(inputs)
         self._publish(outputs)
@@ -128,6 +133,9 @@ class Navigator:
 
     def _on_health(self, health: Health) -> None:
         self._services[health.service] = self._context.clock.now_ns()
+        self._aboard[health.service] = ServiceFact(
+            health.service, health.state, health.pid, health.note, 0.0, health.rates_hz, version=health.version
+        )
 
     def _on_nonce(self, request: NonceRequest) -> NonceReply:
         return self.desk.issue(request.sender, self._context.clock.now_ns())

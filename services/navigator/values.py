@@ -10,6 +10,7 @@ from schemas.navigation import Guidance, GuidanceCommand, MissionState, MissionS
 from schemas.slam import Pose
 from schemas.trees import Target, TreeList
 from schemas.vehicle import VehicleState
+from services.doctor.model import ServiceFact
 from services.navigator.guard import View
 from services.navigator.trajectory import Aim
 
@@ -36,6 +37,8 @@ class Inputs:
     services: Mapping[str, int] = field(default_factory=dict)
     view: Seen[View] | None = None
     """What the depth image shows, for the live guard."""
+    aboard: tuple[ServiceFact, ...] = ()
+    """What the services' latest health says, for preflight."""
 
     def age_s(self, seen: Seen[T] | None) -> float:
         """Return the seconds since a message came, inf when none did."""

@@ -18,6 +18,10 @@ class RouterConfig(BaseModel):
     listen_host: str = Field(default="", pattern=r"^[A-Za-z0-9_.:\[\]-]*$")
     """Where the router itself listens when that is not ``host``: 0.0.0.0 lets other machines in."""
 
+    shared_memory: bool = True
+    """Big messages between processes of this machine go by shared memory where enough of it may be locked; off: all by
+    the protocol."""
+
     @property
     def endpoint(self) -> str:
         """Return the address in Zenoh's writing, for example ``tcp/127.0.0.1:7447``."""

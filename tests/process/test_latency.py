@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from services.common.errors import InputError
-from services.evaluate.bench_latency import Passage, Passages, figures_of, latencies_ms, measure, read_frames, stages_ms
+from services.evaluate.bench_latency import measure
+from services.evaluate.live_set import read_frames
+from services.evaluate.passages import Passage, Passages, figures_of, latencies_ms, stages_ms
 
 MS = 1_000_000
 FRAMES = 45

@@ -11,26 +11,39 @@ import pytest
 
 from services.cli.app import invoke
 from services.common.config import TreedockConfig
+from services.doctor.aboard import against_flight
 from services.doctor.facts import gather
-from services.doctor.findings import Facts, ServiceFact, judge
+from services.doctor.findings import judge
+from services.doctor.model import Facts, ServiceFact, VehicleFact
 from services.recorder.config import RecorderConfig
 from services.security.authority import Authority
 from services.security.identity import Identity
 
 CAMERA = ServiceFact(
-    "camera", "ready", 10, "", 0.2, {"camera/rgbd": 15.0}, locked_bytes=50_000_000, clock_offset_s=0.001
+    "camera",
+    "ready",
+    10,
+    "",
+    0.2,
+    {"camera/rgbd": 15.0},
+    locked_bytes=50_000_000,
+    clock_offset_s=0.001,
+    version="0.1.0+same",
 )
 SLAM = ServiceFact("slam", "ready", 11, "", 0.2, {"slam/pose": 15.0}, clock_offset_s=0.001)
 SOUND = Facts(
     router="tcp/127.0.0.1:7447", wanted_router="tcp/127.0.0.1:7447", services=(CAMERA, SLAM),
     units={"treedock-slam.service": "active"}, clock_synchronised=True, locked_limit_bytes=-1, shm_free_bytes=10**10,
-    disk_free_bytes=10**11, camera="realsense: 4 video devices", source="realsense", calibration_days=20.0,
+    version="0.1.0+same", disk_free_bytes=10**11, camera="realsense: 4 video devices", source="realsense", calibration_days=20.0,
 )  # fmt: skip
+PX4 = ServiceFact("autopilot", "ready", 12, "", 0.2, {"vehicle/state": 20.0})
+FLYING = replace(SOUND, services=(CAMERA, SLAM, PX4), vehicle=VehicleFact(connected=True, note="", battery_share=0.8))
+WRONG = "parameters: EKF2_EV_CTRL is 0, expected 11: fuse vision position, height and yaw"
 ENCRYPTED = replace(SOUND, encrypted=True, certificates={"uav1.slam": 200.0}, reachable_from_outside=True)
 
 
 def test_a_sound_machine_has_no_trouble() -> None:
-    for facts in (SOUND, ENCRYPTED):
+    for facts in (SOUND, ENCRYPTED, FLYING):
         assert {finding.level for finding in judge(facts)} == {"ok"}
 
 
@@ -54,7 +67,24 @@ def test_a_sound_machine_has_no_trouble() -> None:
         (replace(SOUND, disk_free_bytes=2 * 10**9), "disk", "warn", "2.0 GB"),
         (replace(SOUND, recordings_cut=("a.mcap",)), "recordings", "warn", "1 recording"),
         (replace(SOUND, camera=None), "camera", "fail", "not found"),
-        (replace(SOUND, calibration_days=400.0), "calibration", "warn", "400 days"),
+        (replace(SOUND, camera_mbit=480.0), "camera", "warn", "480 Mbit/s"),
+        (replace(SOUND, camera_file="c.json", calibration_days=400.0), "calibration", "warn", "400 days"),
+        (replace(SOUND, camera_file="c.json", calibration_days=None), "calibration", "warn", "does not say"),
+        (replace(SOUND, services=(replace(SLAM, state="unreadable", age_s=99.0),)), "slam", "fail", "another version"),
+        (replace(SOUND, services=(replace(SLAM, state="silent", age_s=99.0),)), "slam", "fail", "hung"),
+        (replace(SOUND, services=(replace(SLAM, version="0.1.0+other"),)), "versions", "fail", "0.1.0+other"),
+        (replace(SOUND, services=(replace(SLAM, version="0.2.0+same"),)), "versions", "warn", "0.2.0+same"),
+        (replace(SOUND, services=(replace(SLAM, clock_offset_s=-1.2),)), "clock", "fail", "-1200 ms"),
+        (replace(SOUND, services=(PX4,), vehicle=None), "PX4", "warn", "no word"),
+        (replace(SOUND, services=(PX4,), vehicle=VehicleFact(connected=False, note="")), "PX4", "warn", "no word"),
+        (replace(FLYING, vehicle=VehicleFact(connected=True, note=WRONG)), "PX4", "fail", "EKF2_EV_CTRL is 0"),
+        (
+            replace(FLYING, vehicle=VehicleFact(connected=True, note="parameters are still being read")),
+            "PX4",
+            "warn",
+            "being read",
+        ),
+        (replace(SOUND, router=None, router_fault="refused: no certificate"), "router", "fail", "no certificate"),
         (replace(SOUND, reachable_from_outside=True), "encryption", "fail", "anybody"),
         (replace(ENCRYPTED, certificates={"uav1.slam": 12.0}), "certificate", "warn", "12 days"),
         (replace(ENCRYPTED, certificates={"uav1.slam": -3.0}), "certificate", "fail", "3 days ago"),
@@ -66,6 +96,34 @@ def test_each_trouble_has_its_finding_and_what_to_do(facts: Facts, about: str, l
     assert len(found) == 1
     assert word in found[0].text
     assert found[0].do
+
+
+def test_preflight_hears_of_failures_and_only_of_those() -> None:
+    hot = replace(SLAM, state="degraded", note="lost", version="0.1.0+other")
+    told = against_flight((CAMERA, hot), VehicleFact(connected=True, note=WRONG), "0.1.0+same")
+    assert len(told) == 1
+    assert "0.1.0+other" in told[0]
+    assert against_flight((PX4,), VehicleFact(connected=True, note=WRONG), "0.1.0+same") == [f"PX4: {WRONG}"]
+
+
+def test_a_camera_is_known_by_its_product_name_and_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    device = tmp_path / "2-1"
+    device.mkdir()
+    (device / "product").write_text("Intel(R) RealSense(TM) Depth Camera 435i\n")
+    (device / "speed").write_text("480\n")
+    monkeypatch.setattr("services.doctor.facts.USB_DEVICES", tmp_path)
+    facts = gather(TreedockConfig.model_validate({"camera": {"source": "realsense"}, "router": {"port": 1}}))
+    assert (facts.camera, facts.camera_mbit) == ("Intel(R) RealSense(TM) Depth Camera 435i", 480.0)
+
+
+def test_the_age_of_a_calibration_is_what_it_says_not_the_files(tmp_path: Path) -> None:
+    file = tmp_path / "camera.json"
+    day = dt.datetime.now(dt.UTC).date() - dt.timedelta(days=200)
+    file.write_text(json.dumps({"calibration": {"day": day.isoformat()}}))
+    config = TreedockConfig.model_validate({"camera": {"camera_file": str(file)}, "router": {"port": 1}})
+    assert gather(config).calibration_days == 200.0
+    file.write_text("{}")
+    assert gather(config).calibration_days is None
 
 
 def test_a_machine_is_really_looked_at(tmp_path: Path) -> None:

@@ -16,9 +16,9 @@ _NAMES = ("k1", "k2", "p1", "p2", "k3")
 
 
 def camera_values(
-    solution: Solution, board: Board, depth_scale: float, mount: Mounting | None = None
+    solution: Solution, board: Board, depth_scale: float, mount: Mounting | None = None, day: str = ""
 ) -> dict[str, Any]:
-    """Return the content of camera.json: what process and the services read, and how it was come by."""
+    """Return the content of camera.json: what process and the services read, and how and on which ``day`` it was come by."""
     width, height = solution.size_px
     K = solution.K
     values: dict[str, Any] = {
@@ -29,6 +29,7 @@ def camera_values(
     if mount is not None:
         values["T_body_camera"] = [[_r(v, 9) for v in row] for row in mount.T_body_camera]
     values["calibration"] = {
+        **({"day": day} if day else {}),
         "board": f"{board.kind} {board.columns}x{board.rows} inner corners, {board.square_m:g} m squares",
         "pictures": len(solution.views), "reprojection_px": _r(solution.rms_px, 4),
         "sigma_fx_px": _r(solution.sigma[0], 4), "sigma_fy_px": _r(solution.sigma[1], 4),

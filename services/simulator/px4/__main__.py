@@ -1,6 +1,6 @@
 """Stands in for PX4 SITL: the simulated autopilot in real time, in a process of its own.
 
-``python -m tests.mission.px4_process REMOTE_PORT [SCENE SEED]`` speaks to 127.0.0.1:REMOTE_PORT until it is killed.
+``python -m services.simulator.px4 REMOTE_PORT [SCENE SEED]`` speaks to 127.0.0.1:REMOTE_PORT until its parent ends.
 """
 
 from __future__ import annotations
@@ -16,8 +16,11 @@ from services.simulator.px4.config import LinkConfig, Px4Config
 from services.simulator.px4.runner import RealTimeRunner
 from services.simulator.px4.warm import warm
 
+_TICK_S = 0.004
+
 
 def main() -> None:
+    """Run until the process that started this one ends."""
     port = int(sys.argv[1])
     name, seed = (sys.argv[2], int(sys.argv[3])) if len(sys.argv) > 3 else ("random-mission", 1)
     px4_config = Px4Config(links=(LinkConfig(local_port=0, remote_port=port),))
@@ -26,7 +29,7 @@ def main() -> None:
     px4 = simulated_px4(scene_for(name, seed), config)
     px4.open_links()
     parent = os.getppid()
-    with RealTimeRunner(px4.step, 0.004):
+    with RealTimeRunner(px4.step, _TICK_S):
         while os.getppid() == parent:
             time.sleep(0.2)
 

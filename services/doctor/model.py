@@ -1,0 +1,87 @@
+"""The facts that a doctor collects and the findings made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+Level = Literal["ok", "warn", "fail", "unknown"]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line of the doctor's report."""
+
+    about: str
+    level: Level
+    text: str
+    do: str = ""
+    """What to do about it; empty when nothing is to be done."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceFact:
+    """A service as its latest health tells it."""
+
+    name: str
+    state: str
+    pid: int
+    note: str
+    age_s: float
+    rates_hz: Mapping[str, float]
+    locked_bytes: int | None = None
+    """VmLck of its process on this machine; None: another machine's, or unreadable."""
+    clock_offset_s: float | None = None
+    """Its stamps against this machine's clock; None: not told."""
+    version: str = ""
+    """Of the treedock that runs there; empty: it does not say."""
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleFact:
+    """The aircraft as the autopilot's bridge tells it."""
+
+    connected: bool
+    note: str
+    """What speaks against flying it: parameters that differ come first."""
+    battery_share: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """Everything the doctor looked at; None stands for what could not be found out."""
+
+    router: str | None = None
+    """The address that answered, None when none did."""
+    router_fault: str = ""
+    """Why there is no session, in the words of the bus."""
+    wanted_router: str = ""
+    services: Sequence[ServiceFact] = ()
+    vehicle: VehicleFact | None = None
+    """None: the bridge said nothing."""
+    version: str = ""
+    """Of the treedock that asks."""
+    units: Mapping[str, str] = field(default_factory=dict)
+    """Unit name to systemd's ActiveState; empty when none is installed."""
+    certificates: Mapping[str, float] = field(default_factory=dict)
+    """Identity to days of validity left."""
+    loose_keys: Sequence[str] = ()
+    """Private keys that others can read."""
+    encrypted: bool = False
+    reachable_from_outside: bool = False
+    clock_synchronised: bool | None = None
+    locked_limit_bytes: int | None = None
+    """RLIMIT_MEMLOCK of this session; -1: unlimited."""
+    shm_free_bytes: int | None = None
+    disk_free_bytes: int | None = None
+    recordings_cut: Sequence[str] = ()
+    camera: str | None = None
+    """What the configured source found, None when nothing."""
+    camera_mbit: float | None = None
+    """Speed of its USB link."""
+    source: str = "sim"
+    camera_file: str = ""
+    """The calibration in use; empty: the sensor's own, from the factory."""
+    calibration_days: float | None = None
+    """Its age; None: it does not say."""

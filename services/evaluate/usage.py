@@ -1,0 +1,70 @@
+"""What processes use: processor time and memory, and the budget of each service."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import psutil
+
+_MB = 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class Usage:
+    """What one process used over a while."""
+
+    cpu_cores: float
+    """Processor time over wall time."""
+    pss_mb: float
+    """Its memory; what it shares with others is counted in parts (PSS), so that a sum counts it once."""
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """What a service may use aboard at 30 frames a second of 640x480."""
+
+    cpu_cores: float
+    pss_mb: float
+
+
+TOLERANCE = 1.2
+"""A service is over its budget beyond this."""
+
+
+class Meter:
+    """Measures processes from its making on, by name."""
+
+    def __init__(self, pids: Mapping[str, int]) -> None:
+        self._processes = {name: psutil.Process(pid) for name, pid in pids.items()}
+        self._begin_s = time.monotonic()
+        self._cpu_s = {name: _cpu_s(process) for name, process in self._processes.items()}
+
+    def read(self) -> dict[str, Usage]:
+        """Return what each used since; its memory now."""
+        elapsed_s = time.monotonic() - self._begin_s
+        return {
+            name: Usage((_cpu_s(process) - self._cpu_s[name]) / elapsed_s, process.memory_full_info().pss / _MB)
+            for name, process in self._processes.items()
+        }
+
+
+def _cpu_s(process: psutil.Process) -> float:
+    times = process.cpu_times()
+    return float(times.user + times.system)
+
+
+def over_budget(used: Mapping[str, Usage], budgets: Mapping[str, Budget]) -> list[str]:
+    """Return in words what exceeds its budget by more than a fifth; a process without a budget does, too."""
+    found = []
+    for name, usage in sorted(used.items()):
+        budget = budgets.get(name)
+        if budget is None:
+            found.append(f"{name} has no budget")
+            continue
+        if usage.cpu_cores > TOLERANCE * budget.cpu_cores:
+            found.append(f"{name} takes {usage.cpu_cores:.2f} cores of {budget.cpu_cores:.2f}")
+        if usage.pss_mb > TOLERANCE * budget.pss_mb:
+            found.append(f"{name} takes {usage.pss_mb:.0f} MB of {budget.pss_mb:.0f}")
+    return found
