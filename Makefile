@@ -1,5 +1,5 @@
 # The two commands of the README, and what they rest on.
-.PHONY: setup run test lint types fast format
+.PHONY: setup run test lint types fast format fuzz
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -24,3 +24,8 @@ format:
 
 fast: lint types
 	@$(BIN)/pytest tests/unit tests/contract tests/architecture
+
+# Every reader of foreign bytes, for as many cases as wanted: make fuzz CASES=20000
+fuzz: CASES ?= 5000
+fuzz:
+	@TREEDOCK_FUZZ=$(CASES) $(BIN)/pytest -q tests/fuzz

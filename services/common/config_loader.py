@@ -9,7 +9,7 @@ import difflib
 import json
 import os
 import tomllib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,19 +17,13 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from services.common.config import TreedockConfig
+from services.common.config_versions import current
 from services.common.errors import InputError
 
 SYSTEM_DIRECTORY = Path("/etc/treedock")
 _PREFIX = "TREEDOCK_"
 _NOT_SETTINGS = frozenset({"TREEDOCK_DATA", "TREEDOCK_CONFIG"})
 """Variables of tests and of the deployment; TREEDOCK_CONFIG stands for --config."""
-
-
-Migration = Callable[[dict[str, Any]], dict[str, Any]]
-
-MIGRATIONS: Mapping[int, Migration] = {}
-"""Version of a configuration file to the change that makes it the next version's. A renamed or moved key adds one, so
-that files in the field go on working; ``treedock config --migrate`` writes them anew."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,32 +39,6 @@ class _Setting:
     key: str
     value: object
     origin: str
-
-
-def current(body: dict[str, Any], origin: str, migrations: Mapping[int, Migration] = MIGRATIONS) -> dict[str, Any]:
-    """Return a file's content as this version writes it, without its ``config_version``.
-
-    Args:
-        body: as read.
-        origin: the file's name, for the error.
-        migrations: version to the change that leads to the next one.
-
-    Raises:
-        InputError: the file is of a newer treedock, or its version is no number.
-    """
-    body = dict(body)
-    newest = max(migrations, default=0) + 1
-    version = body.pop("config_version", newest)
-    if not isinstance(version, int) or isinstance(version, bool) or version < 1:
-        raise InputError(f"{origin}: config_version = {version!r}: expected a number from 1 to {newest}")
-    if version > newest:
-        raise InputError(
-            f"{origin}: config_version = {version} was written for a newer treedock; this one reads up to {newest}: "
-            "update treedock on this machine, or take the file of its version"
-        )
-    for number in range(version, newest):
-        body = migrations[number](body)
-    return body
 
 
 def load(

@@ -10,8 +10,9 @@ import zenoh
 from services.common.config import TreedockConfig
 from services.common.errors import InputError
 from services.common.runtime import run_service
-from services.common.session import opened, port_is_free, router_config, split_endpoint
+from services.common.session import memory_settings, opened, port_is_free, router_config, split_endpoint
 from services.common.stop import StopSignal
+from services.router.watch import RegisterWatch
 from services.security.transport import router_settings
 
 
@@ -23,7 +24,7 @@ def listening(config: TreedockConfig) -> Iterator[zenoh.Session]:
         InputError: the port is taken, the address is not this machine's, or a certificate is missing.
     """
     endpoint = config.router.listen_endpoint
-    secured = router_settings(config.security, config.uav)
+    secured = router_settings(config.security, config.uav) | memory_settings(config)
     protocol, host, port = split_endpoint(endpoint)
     if protocol != "quic" and not port_is_free(host, port):
         raise InputError(f"port {port} on {host} is in use: stop what listens there, or choose another with --port")
@@ -36,9 +37,16 @@ def listening(config: TreedockConfig) -> Iterator[zenoh.Session]:
 
 
 def run(config: TreedockConfig, stop: StopSignal | None = None) -> int:
-    """Run the router until it is stopped; return the exit code.
+    """Run the router until it is stopped, or the list of certificates changes; return the exit code.
+
+    A session's access rules cannot be changed: the router ends, and its supervisor (systemd, ``treedock run``) starts it
+    with the new ones. Nodes are back within seconds, those that were revoked without any right.
 
     Raises:
-        InputError: the port is taken.
+        InputError: the port is taken, or a certificate is missing.
     """
-    return run_service("router", lambda _: None, config, stop, session=lambda _: listening(config))
+    if stop is None:
+        stop = StopSignal()
+        stop.install()
+    watch = RegisterWatch(config.security, stop.set)
+    return run_service("router", watch.register, config, stop, session=lambda _: listening(config))

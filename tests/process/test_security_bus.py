@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import datetime as dt
 import json
+import threading
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -18,6 +19,8 @@ from services.common.config import TreedockConfig
 from services.common.context import HealthBook
 from services.common.errors import InputError
 from services.common.session import free_port, opened, opened_node, router_config
+from services.common.stop import StopSignal
+from services.router.service import run as run_router
 from services.security.access import may_publish, may_subscribe
 from services.security.authority import Authority
 from services.security.config import SecurityConfig
@@ -215,3 +218,63 @@ def test_a_revoked_certificate_and_another_aircrafts_have_no_rights(folder: Path
         time.sleep(0.5)
     assert heard == ["good true"]
     assert not [r for r in replies if r.ok is not None]
+
+
+def test_a_router_that_gets_another_list_ends_and_comes_back_without_the_revoked(tmp_path: Path) -> None:
+    """End to end: ``certs revoke``, the new list copied to the router's machine, and nothing else done by hand."""
+    fleet, aboard = tmp_path / "fleet", tmp_path / "aboard"
+    authority = Authority.create(fleet, now())
+    for name in ("uav1.router", "uav1.navigator", "station.eve", "station.alice"):
+        authority = authority.issue(Identity.parse(name), now(), hosts=("127.0.0.1",))
+    authority.export([Identity.parse("uav1.router"), Identity.parse("uav1.navigator")], aboard)
+    config = configured(aboard, free_port())
+
+    def answered(station: str, within_s: float = 10.0) -> bool:
+        with node(fleet, config.router.port, station) as session:
+            end = time.monotonic() + within_s
+            while time.monotonic() < end:
+                replies = session.get("treedock/v1/uav1/cmd/hold", timeout=0.5)
+                if any(r.ok is not None for r in replies):
+                    return True
+            return False
+
+    def answer(query: zenoh.Query) -> None:
+        with query:
+            query.reply(query.key_expr, "heard")
+
+    ended: list[int] = []
+    with supervised(config, ended), node(aboard, config.router.port, "uav1.navigator") as navigator:
+        navigator.declare_queryable("treedock/v1/uav1/cmd/hold", answer)
+        assert answered("station.eve")
+        (aboard / "identities.json").write_text("{")
+        time.sleep(1.5)
+        assert not ended, "a damaged list leaves the rights in force"
+        authority.revoke(Identity.parse("station.eve")).export([], aboard)
+        end = time.monotonic() + 20.0
+        while not ended and time.monotonic() < end:
+            time.sleep(0.05)
+        assert ended == [0]
+        assert answered("station.alice"), "the aircraft is reached again"
+        assert not answered("station.eve", within_s=2.0)
+
+
+@contextlib.contextmanager
+def supervised(config: TreedockConfig, ended: list[int]) -> Iterator[None]:
+    """Run the router on a thread, started again whenever it ends, as a supervisor does."""
+    over, stops = threading.Event(), [StopSignal()]
+
+    def keep() -> None:
+        while not over.is_set():
+            code = run_router(config, stops[-1])
+            if not over.is_set():
+                stops.append(StopSignal())
+                ended.append(code)
+
+    thread = threading.Thread(target=keep, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        stops[-1].set()
+        thread.join(10.0)

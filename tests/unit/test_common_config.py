@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tomllib
 from pathlib import Path
 
@@ -9,8 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from services.cli.app import invoke
 from services.common.config import TreedockConfig
-from services.common.config_loader import current, known_keys, load, to_toml
+from services.common.config_loader import known_keys, load, to_toml
+from services.common.config_versions import Migration, current, migrate_file
 from services.common.errors import InputError
 
 
@@ -131,7 +134,7 @@ def test_a_file_from_the_future_is_refused_by_name(tmp_path: Path) -> None:
         load(path, environ={}, system_directory=tmp_path / "none")
 
 
-@pytest.mark.parametrize("version", ['"1"', "0", "-3", "true", "1.5"])
+@pytest.mark.parametrize("version", ['"1"', "-1", "-3", "true", "1.5"])
 def test_a_version_is_a_number(tmp_path: Path, version: str) -> None:
     path = write(tmp_path, "a.toml", f"config_version = {version}\n")
     with pytest.raises(InputError, match="config_version"):
@@ -145,11 +148,12 @@ def test_old_files_are_read_through_every_step() -> None:
     def doubled(body: dict[str, object]) -> dict[str, object]:
         return {key: value * 2 if isinstance(value, int) else value for key, value in body.items()}
 
-    steps = {1: renamed, 2: doubled}
+    steps = {1: Migration(("old",), renamed), 2: Migration((), doubled)}
     assert current({"config_version": 1, "old": 4}, "f", steps) == {"new": 8}
     assert current({"config_version": 2, "new": 4}, "f", steps) == {"new": 8}
     assert current({"config_version": 3, "new": 4}, "f", steps) == {"new": 4}
     assert current({"new": 4}, "f", steps) == {"new": 4}, "no version: today's"
+    assert current({"old": 4}, "f", steps) == {"new": 8}, "no version, but a key that only an old one knew"
     with pytest.raises(InputError, match="up to 3"):
         current({"config_version": 4}, "f", steps)
 
@@ -157,3 +161,56 @@ def test_old_files_are_read_through_every_step() -> None:
 def test_this_version_is_read(tmp_path: Path) -> None:
     path = write(tmp_path, "a.toml", 'config_version = 1\nuav = "kea"\n')
     assert load(path, environ={}, system_directory=tmp_path / "none").config.uav == "kea"
+
+
+OLD = '# ours\nuav = "kea"\n[slam]\nfeatures = 800\naccel_window_s = 0.5\nkeyframe_interval_max = 20\n'
+
+
+@pytest.mark.parametrize("head", ["", "config_version = 0\n"])
+def test_a_file_of_the_first_days_is_read(tmp_path: Path, head: str) -> None:
+    found = load(write(tmp_path, "a.toml", head + OLD), environ={}, system_directory=tmp_path / "none").config
+    assert (found.uav, found.slam.features) == ("kea", 800)
+
+
+def test_a_file_that_says_it_is_new_may_not_hold_old_keys(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="accel_window_s"):
+        load(write(tmp_path, "a.toml", "config_version = 1\n" + OLD), environ={}, system_directory=tmp_path / "none")
+
+
+def test_migration_writes_the_file_anew_and_keeps_the_old_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write(tmp_path, "a.toml", OLD)
+    path.chmod(0o640)
+    before = load(path, environ={}, system_directory=tmp_path / "none").config
+    assert invoke(["config", "--migrate", "--config", str(path)]) == 0
+    assert "version 1" in capsys.readouterr().out
+    assert tomllib.loads(path.read_text())["config_version"] == 1
+    assert path.stat().st_mode & 0o777 == 0o640
+    assert (tmp_path / "a.toml.old").read_text() == OLD
+    assert load(path, environ={}, system_directory=tmp_path / "none").config == before
+    assert invoke(["config", "--migrate", "--config", str(path)]) == 0
+    assert "already" in capsys.readouterr().out
+
+
+def test_a_failed_migration_leaves_the_file_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path, "a.toml", OLD)
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(InputError, match="No space left"):
+        migrate_file(path)
+    assert path.read_text() == OLD
+
+
+def test_a_file_from_the_future_is_not_migrated(tmp_path: Path) -> None:
+    path = write(tmp_path, "a.toml", "config_version = 7\n")
+    with pytest.raises(InputError, match="newer treedock"):
+        migrate_file(path)
+
+
+def test_the_dump_carries_the_version_and_is_read_again(capsys: pytest.CaptureFixture[str]) -> None:
+    assert invoke(["config"]) == 0
+    assert current(tomllib.loads(capsys.readouterr().out), "dump")["uav"] == "uav1"
