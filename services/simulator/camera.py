@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from schemas.camera import Intrinsics
 from services.simulator.config import SensorConfig
-from services.simulator.render import DEFAULT_INTRINSICS, Renderer, halved
+from services.simulator.models import CAMERA_MODELS
+from services.simulator.render import Renderer, halved
 from services.simulator.scene import Floats
 from services.simulator.sensor import RgbdSensor, SensorImages
 from services.simulator.world import World
@@ -14,11 +15,11 @@ class SimulatedCamera:
     """An RGB-D camera in a world; always gives full-size images."""
 
     def __init__(self, world: World, config: SensorConfig, reduced: bool = False, seed: int = 0) -> None:
-        self.intrinsics: Intrinsics = DEFAULT_INTRINSICS
+        self.intrinsics: Intrinsics = CAMERA_MODELS[config.model].intrinsics
         self.render_scale = 0.5 if reduced else 1.0
         rendered = halved(self.intrinsics) if reduced else self.intrinsics
         self._renderer = Renderer(world, rendered)
-        self._sensor = RgbdSensor(config, (rendered.height, rendered.width), self.render_scale, seed)
+        self._sensor = RgbdSensor(config, (rendered.height, rendered.width), self.render_scale, seed, rendered)
 
     def look(self, T_world_camera: Floats, seq: int) -> SensorImages:
         """Return the images at a pose; ``seq`` draws the noise."""

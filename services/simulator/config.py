@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from services.simulator.px4.config import LinkConfig, Px4Config
+
+SensorName = Literal["own", "kinect1", "kinect2", "r200", "d435", "bumblebee2"]
 
 
 class SensorConfig(BaseModel):
@@ -14,10 +16,20 @@ class SensorConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    model: SensorName = "own"
+    """``own``: what the fields below say; another: that camera's image and figures (models.py), except for fields below
+    that differ from their defaults."""
+    sunlight: bool = False
+    """Direct sun on everything: stereo does not mind, structured light sees nothing, time of flight is not modelled."""
+    law: Literal["stereo", "time_of_flight"] = "stereo"
+    """``stereo``: noise in the disparity, the next fields; ``time_of_flight``: Fankhauser et al., "Kinect v2 for mobile
+    robot navigation" (2015)."""
     disparity_sigma_px: float = Field(default=0.08, ge=0.0, le=1.0)
     """Matching noise s; 0 gives perfect depth within the range, without edges or holes."""
     fixed_share: float = Field(default=0.4, ge=0.0, le=1.0)
     """Share of the noise's variance that is the same in every frame."""
+    disparity_step_px: float = Field(default=0.0, ge=0.0, le=1.0)
+    """Disparity comes in whole steps of this; 0: as fine as may be."""
     focal_px: float = Field(default=565.0, gt=0.0)
     baseline_m: float = Field(default=0.070, gt=0.0)
     min_range_m: float = Field(default=0.5, ge=0.0)
@@ -30,6 +42,12 @@ class SensorConfig(BaseModel):
     exposure_swing: float = Field(default=0.04, ge=0.0, le=0.5)
     accel_sigma_m_s2: float = Field(default=0.08, ge=0.0)
     accel_bias_m_s2: float = Field(default=0.08, ge=0.0)
+
+    @model_validator(mode="after")
+    def _known_in_sunlight(self) -> Self:
+        if self.sunlight and (self.model == "kinect2" or self.law == "time_of_flight"):
+            raise ValueError("sunlight: how a time-of-flight camera fares in it is not modelled; set it to false")
+        return self
 
 
 class PathConfig(BaseModel):

@@ -59,7 +59,7 @@ class Renderer:
         hits = self.world.cast(self._rays)
         texture.paint(
             self._table, self._palette, self.world.material, self._rays, hits.distance, hits.part, hits.normal,
-            self._sun, np.float32(1.0 / self.intrinsics.fx), self._colour,
+            self._sun, np.float32(1.0 / min(self.intrinsics.fx, self.intrinsics.fy)), self._colour,
         )  # fmt: skip
         return Rendering(self._colour, hits.distance)
 

@@ -3,7 +3,7 @@
 Depth follows the disparity ``d = f B / z`` (B 70 mm, f 565 px at 640: the R200). Matching noise of s px in d gives
 ``sigma_z = z^2 s / (f B)``; part of it is a fixed pattern of the image, so averaging does not remove it; neighbours
 share it, as they share the matching window. At a depth edge the window holds both sides: 5 mixed pixels. What the
-second infrared camera cannot see is a hole beside the nearer object.
+second infrared camera cannot see is a hole beside the nearer object. Other cameras and a time-of-flight one: models.py.
 """
 
 from __future__ import annotations
@@ -14,9 +14,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from schemas.camera import Intrinsics
 from services.simulator.config import SensorConfig
-from services.simulator.render import Rendering
+from services.simulator.models import CAMERA_MODELS, blind_pixels, settings_of
+from services.simulator.render import DEFAULT_INTRINSICS, Rendering
 from services.simulator.scene import Floats
+from services.simulator.time_of_flight import WINDOW_PX, dropout_quantile, measure
 from services.simulator.world import Floats32
 
 GRAVITY_M_S2 = 9.80665
@@ -42,10 +45,21 @@ class SensorImages:
 class RgbdSensor:
     """Turns renderings of one size into the camera's images; frame ``seq`` gets the same noise in every run."""
 
-    def __init__(self, config: SensorConfig, shape: tuple[int, int], render_scale: float = 1.0, seed: int = 0) -> None:
-        """Prepare the noise for renderings of ``shape`` (H, W), which are scaled up by ``1 / render_scale``."""
-        self._config = config
+    def __init__(
+        self, config: SensorConfig, shape: tuple[int, int], render_scale: float = 1.0, seed: int = 0,
+        intrinsics: Intrinsics = DEFAULT_INTRINSICS,
+    ) -> None:  # fmt: skip
+        """Prepare the noise for renderings of ``shape`` (H, W), which are scaled up by ``1 / render_scale``.
+
+        ``intrinsics`` are the renderings'; the simulator's own camera does not ask for them.
+        """
+        self._config = config = settings_of(config)
+        self._intrinsics = intrinsics
+        self._blind = blind_pixels(CAMERA_MODELS[config.model], intrinsics)
         self._scale = render_scale
+        own = config.model == "own"
+        self._shift_share = render_scale if own else intrinsics.fx / config.focal_px
+        """Image pixels by which a disparity of one pixel shifts the second camera's view."""
         self._seed = seed
         rng = np.random.default_rng([seed, 301])
         grain = _GRAIN_PX * render_scale
@@ -69,6 +83,36 @@ class RgbdSensor:
         return SensorImages(larger, np.repeat(np.repeat(depth, times, axis=0), times, axis=1))
 
     def _measure(self, depth_m: Floats32, rng: np.random.Generator) -> NDArray[np.uint16]:
+        config = self._config
+        if config.sunlight and config.model == "kinect1":
+            return np.zeros(depth_m.shape, dtype=np.uint16)
+        timed = config.law == "time_of_flight"
+        out = self._timed(depth_m, rng) if timed else self._triangulated(depth_m, rng)
+        if self._blind is not None:
+            out[self._blind] = 0
+        return out
+
+    def _timed(self, depth_m: Floats32, rng: np.random.Generator) -> NDArray[np.uint16]:
+        import cv2
+
+        c, i = self._config, self._intrinsics
+        window = np.ones((WINDOW_PX, WINDOW_PX), dtype=np.uint8)
+        solid = np.minimum(depth_m, np.float32(100.0))
+        spread = np.asarray(cv2.dilate(solid, window) - cv2.erode(solid, window), dtype=np.float32)
+        mixed = np.asarray(cv2.blur(solid, (WINDOW_PX, WINDOW_PX)), dtype=np.float32)
+        limits = (c.min_range_m, c.fade_range_m, c.max_range_m, c.dropout)
+        out = np.zeros(depth_m.shape, dtype=np.uint16)
+        measure(solid, spread, mixed, self._noise(rng), self._draw(rng), (i.fx, i.fy), limits, out)
+        return out
+
+    def _noise(self, rng: np.random.Generator) -> Floats32:
+        """Return a field of unit variance, part of it the same in every frame."""
+        noise = 0.8 * self._draw(rng) + 0.6 * self._draw(rng)
+        fixed = np.float32(np.sqrt(self._config.fixed_share))
+        noise = fixed * self._fixed + np.float32(np.sqrt(1.0 - self._config.fixed_share)) * noise
+        return np.asarray(noise.astype(np.float32))
+
+    def _triangulated(self, depth_m: Floats32, rng: np.random.Generator) -> NDArray[np.uint16]:
         import cv2
 
         config = self._config
@@ -78,14 +122,12 @@ class RgbdSensor:
         window = np.ones((_WINDOW_PX, _WINDOW_PX), dtype=np.uint8)
         spread = np.asarray(cv2.dilate(disparity, window) - cv2.erode(disparity, window), dtype=np.float32)
         mixed = np.asarray(cv2.blur(disparity, (_WINDOW_PX, _WINDOW_PX)), dtype=np.float32)
-        noise = 0.8 * self._draw(rng) + 0.6 * self._draw(rng)
-        fixed = np.float32(np.sqrt(config.fixed_share))
-        noise = fixed * self._fixed + np.float32(np.sqrt(1.0 - config.fixed_share)) * noise
+        noise = self._noise(rng)
         out = np.zeros(depth_m.shape, dtype=np.uint16)
         _stereo(
-            disparity, spread, mixed, noise.astype(np.float32), self._draw(rng), self._scale, config.disparity_sigma_px,
-            config.focal_px * config.baseline_m, config.min_range_m, config.fade_range_m, config.max_range_m,
-            config.dropout, out,
+            disparity, spread, mixed, noise, self._draw(rng), self._shift_share, config.disparity_sigma_px,
+            config.disparity_step_px, config.focal_px * config.baseline_m, config.min_range_m, config.fade_range_m,
+            config.max_range_m, config.dropout, out,
         )  # fmt: skip
         return out
 
@@ -120,13 +162,12 @@ def _quantised(depth_m: Floats32, near_m: float, far_m: float) -> NDArray[np.uin
 @njit(cache=True, nogil=True, error_model="numpy")
 def _stereo(
     disparity: Floats32, spread: Floats32, mixed: Floats32, noise: Floats32, holes: Floats32, scale: float,
-    sigma_px: float, focal_baseline: float, near_m: float, fade_m: float, far_m: float, dropout: float,
+    sigma_px: float, step_px: float, focal_baseline: float, near_m: float, fade_m: float, far_m: float, dropout: float,
     out: NDArray[np.uint16],
 ) -> None:  # fmt: skip
     """Fill ``out`` with millimetres. ``holes`` is a unit normal field that says where matching fails first."""
     height, width = disparity.shape
-    # normal quantiles: dropout is small, so its threshold stands far out in the field's tail
-    tail = -np.sqrt(max(0.0, -2.0 * np.log(max(dropout, 1e-9) * 2.0)))
+    tail = dropout_quantile(dropout)
     for v in range(height):
         seen = 1e9
         for u in range(width - 1, -1, -1):
@@ -144,6 +185,8 @@ def _stereo(
             if edge:
                 limit = -0.4
             d += sigma_px * noise[v, u]
+            if step_px > 0.0:
+                d = step_px * np.round(d / step_px)
             if d <= 0.0:
                 continue
             z = focal_baseline / d

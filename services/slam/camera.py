@@ -28,6 +28,8 @@ class CameraModel:
     """(levels,) scale of each octave."""
     variance: F64
     """(levels,) variance of u and v by octave, pixels squared."""
+    focal: float
+    """Pixels per radian whatever the direction: the root mean square of fx and fy, which differ in a squeezed image."""
 
 
 def camera_model(intrinsics: Intrinsics, config: SlamConfig) -> CameraModel:
@@ -38,4 +40,5 @@ def camera_model(intrinsics: Intrinsics, config: SlamConfig) -> CameraModel:
     return CameraModel(
         array=np.array([i.fx, i.fy, i.cx, i.cy, bf]),
         width=float(i.width), height=float(i.height), cols=grid_size(i)[0], scales=scales, variance=scales**2,
+        focal=float(np.sqrt(0.5 * (i.fx**2 + i.fy**2))),
     )  # fmt: skip

@@ -96,7 +96,7 @@ class Mapping:
         if not self.hurried():
             self.adjust_window(k)
         with self.step():
-            self.far.learn(atlas.points, atlas.keyframes, self.camera.array[0])
+            self.far.learn(atlas.points, atlas.keyframes, self.camera.focal)
         self._cull_keyframes(k)
         self._thin()
         self.pay(k)

@@ -88,7 +88,7 @@ class Tracking:
 
     def _doubt_of_last(self, known: I32, features: I32, last: Tracked | None, R: F64, t: F64) -> F64:
         """Return the doubt (M,) of the last frame's ``features``: of map points ``known``, or (-1) temporary ones."""
-        atlas, focal, sigma = self.atlas, self.camera.array[0], self.far.sigma_inverse_m
+        atlas, focal, sigma = self.atlas, self.camera.focal, self.far.sigma_inverse_m
         doubt = far_doubt(atlas.points, atlas.keyframes, known, R, t, focal, sigma)
         if last is not None:
             step_m = moved(R, t, last.R, last.t)[0]
@@ -208,7 +208,7 @@ class Tracking:
         point[match[got]] = ids[got]
         index = np.flatnonzero(point >= 0)
         R, t = frame.R.copy(), frame.t.copy()
-        doubt = far_doubt(p, self.atlas.keyframes, point[index], R, t, cam.array[0], self.far.sigma_inverse_m)
+        doubt = far_doubt(p, self.atlas.keyframes, point[index], R, t, cam.focal, self.far.sigma_inverse_m)
         count, use, H, chi2 = self.refine(f, R, t, p.pos[point[index]], index, doubt)
         if tally:
             p.visible[ids[~np.isnan(place[:, 0])]] += 1

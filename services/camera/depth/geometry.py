@@ -22,7 +22,7 @@ def register(
     """
     x, y = _rays(depth_camera)
     c = colour_camera
-    k = np.array([c.fx, c.fy, c.cx, c.cy, depth_camera.fx, c.k1, c.k2, c.p1, c.p2, c.k3])
+    k = np.array([c.fx, c.fy, c.cx, c.cy, depth_camera.fx, c.k1, c.k2, c.p1, c.p2, c.k3, depth_camera.fy])
     out = np.empty((colour_camera.height, colour_camera.width), np.float32)
     kernels.splat(depth_m, x, y, T_colour_depth, k, out)
     return out

@@ -189,8 +189,8 @@ def splat(
 ) -> None:
     """Register depth to another camera: move each pixel's point by ``T`` (4, 4) and draw it, the nearest wins.
 
-    ``k``: fx fy cx cy of the target (its width and height are ``out``'s), the source's focal length, and the target's
-    k1 k2 p1 p2 k3. A pixel is drawn with the size it has in the target, so that a finer target image has no gaps.
+    ``k``: fx fy cx cy of the target (its width and height are ``out``'s), the source's fx, the target's k1 k2 p1 p2 k3, and
+    the source's fy. A pixel is drawn with the size it has in the target, so that a finer target image has no gaps.
     """
     height, width = out.shape
     out[:] = 0.0
@@ -209,7 +209,7 @@ def splat(
             radial = 1.0 + r2 * (k[5] + r2 * (k[6] + r2 * k[9]))
             ut = k[0] * (xt * radial + 2.0 * k[7] * xt * yt + k[8] * (r2 + 2.0 * xt * xt)) + k[2]
             vt = k[1] * (yt * radial + k[7] * (r2 + 2.0 * yt * yt) + 2.0 * k[8] * xt * yt) + k[3]
-            half_u, half_v = 0.5 * k[0] / k[4] * z / zt, 0.5 * k[1] / k[4] * z / zt
+            half_u, half_v = 0.5 * k[0] / k[4] * z / zt, 0.5 * k[1] / k[10] * z / zt
             first_u, last_u = max(math.ceil(ut - half_u), 0), min(math.floor(ut + half_u), width - 1)
             first_v, last_v = max(math.ceil(vt - half_v), 0), min(math.floor(vt + half_v), height - 1)
             for b in range(first_v, last_v + 1):

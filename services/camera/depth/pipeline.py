@@ -126,4 +126,4 @@ def warm() -> None:
     config = DepthConfig(drop_mixed=True, bilateral=True, fill_holes=True, temporal=True)
     DepthPipeline(config, (16, 16)).process(np.ones((16, 16), np.float32), np.zeros((16, 16), np.uint8))
     flat = np.zeros((4, 4), np.float32)
-    kernels.splat(flat, flat, flat, np.eye(4), np.ones(10), flat.copy())
+    kernels.splat(flat, flat, flat, np.eye(4), np.ones(11), flat.copy())
