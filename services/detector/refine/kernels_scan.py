@@ -32,7 +32,6 @@ def scan_rows(
     ``noise``: sigma per z^2, floor, ray spacing (1/f).
     """
     count = 0
-    first, final = seen_columns(depth)
     for v in rows:
         start, last, last_z = -1, -1, 0.0
         for u in range(u0, u1 + 1):
@@ -43,38 +42,14 @@ def scan_rows(
             if not _inside(z, x, y, M, up_row, camera_z_m, limits):
                 continue
             if start >= 0 and (u - last > _MAX_GAP_PX or abs(z - last_z) > jump_m(last_z, u - last, noise)):
-                count = _close(depth, ray_x, ray_y, M, v, start, last, first, final, limits, noise, runs, count)
+                count = _close(depth, ray_x, ray_y, M, v, start, last, limits, noise, runs, count)
                 start = -1
             if start < 0:
                 start = u
             last, last_z = u, z
         if start >= 0:
-            count = _close(depth, ray_x, ray_y, M, v, start, last, first, final, limits, noise, runs, count)
+            count = _close(depth, ray_x, ray_y, M, v, start, last, limits, noise, runs, count)
     return count
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def seen_columns(depth: Depth) -> tuple[int, int]:
-    """Return the first and the last column with any depth: beyond them the sensor does not look.
-
-    A depth camera that is narrower than the colour image it is registered to leaves margins (the R200: 61 of 640 px at
-    each side); what ends there was cut, as at the image's border.
-    """
-    width = depth.shape[1]
-    first, final = 0, width - 1
-    while first < width and not _any_depth(depth, first):
-        first += 1
-    while final > first and not _any_depth(depth, final):
-        final -= 1
-    return first, final
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _any_depth(depth: Depth, u: int) -> bool:
-    v = depth.shape[0] - 1  # from below: the ground is the likeliest to be seen
-    while v >= 0 and not depth[v, u] > 0.0:
-        v -= 1
-    return v >= 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -109,15 +84,13 @@ def _ray(ray_x: Depth, ray_y: Depth, M: Matrix, v: int, u: int) -> tuple[float, 
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _beside(depth: Depth, v: int, u: int, step: int, first: int, final: int, noise: Matrix) -> float:
-    """Say what lies beyond the run's end u: the first depth there, judged against the run's own.
-
-    Columns before ``first`` and after ``final`` are outside the sensor's view.
-    """
+def _beside(depth: Depth, v: int, u: int, step: int, noise: Matrix) -> float:
+    """Say what lies beyond the run's end u: the first depth there, judged against the run's own."""
     z = depth[v, u]
+    width = depth.shape[1]
     for k in range(1, _LOOK_BESIDE_PX + 1):
         w = u + step * k
-        if w < first or w > final:
+        if w < 0 or w >= width:
             return BORDER
         other = depth[v, w]
         if not other > 0.0:
@@ -133,8 +106,8 @@ def _beside(depth: Depth, v: int, u: int, step: int, first: int, final: int, noi
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _close(
-    depth: Depth, ray_x: Depth, ray_y: Depth, M: Matrix, v: int, first: int, last: int, seen_first: int, seen_last: int,
-    limits: Matrix, noise: Matrix, runs: Matrix, count: int,
+    depth: Depth, ray_x: Depth, ray_y: Depth, M: Matrix, v: int, first: int, last: int, limits: Matrix,
+    noise: Matrix, runs: Matrix, count: int,
 ) -> int:  # fmt: skip
     """Write one run and return the new count; a single pixel is none."""
     if last - first < 1 or count >= runs.shape[0]:
@@ -163,8 +136,7 @@ def _close(
     half = 0.5 * (math.atan2(b0, a0) - math.atan2(b1, a1)) / (last - first)
     run[LEFT_RAD], run[RIGHT_RAD] = math.atan2(b0, a0) + half, math.atan2(b1, a1) - half
     run[NEAR_M], run[MIN_M], run[MAX_M] = near_sum / near_n, low, high
-    run[LEFT_KIND] = _beside(depth, v, first, -1, seen_first, seen_last, noise)
-    run[RIGHT_KIND] = _beside(depth, v, last, 1, seen_first, seen_last, noise)
+    run[LEFT_KIND], run[RIGHT_KIND] = _beside(depth, v, first, -1, noise), _beside(depth, v, last, 1, noise)
     run[FIRST_H], run[LAST_H] = h0 / math.hypot(a0, b0), h1 / math.hypot(a1, b1)
     return count + 1
 
