@@ -54,14 +54,10 @@ def test_a_trunk_that_the_margin_cuts_is_not_taken_for_a_thin_one(shown_px: int)
 
 
 def test_registration_from_a_squeezed_camera_leaves_no_gaps() -> None:
-    squeezed = Intrinsics(width=160, height=120, fx=114.0, fy=152.0, cx=79.5, cy=59.5)
-    tall = squeezed.model_copy(update={"fx": 150.0, "fy": 150.0, "width": 210, "cx": 104.7})
+    squeezed = Intrinsics(width=160, height=120, fx=152.0, fy=114.0, cx=79.5, cy=59.5)
+    square = squeezed.model_copy(update={"fx": 150.0, "fy": 150.0, "height": 157, "cy": 78.1})
     wall = np.full((120, 160), 2.0, np.float32)
-    assert (register(wall, squeezed, tall, np.eye(4))[2:-2, 2:-2] == 2.0).all()
-    # the other way a pixel must not be drawn larger than it is: a step stays where it was
-    wall[:60] = 1.0
-    out = register(wall, squeezed, squeezed, np.eye(4))
-    assert np.array_equal(out, wall)
+    assert (register(wall, squeezed, square, np.eye(4))[2:-2, 2:-2] == 2.0).all()
 
 
 def test_the_guard_puts_obstacles_where_they_are() -> None:
