@@ -10,19 +10,27 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.camera import Intrinsics
 from schemas.mapping import Submap
 from schemas.simulation import TrueTree
 from services.common.geometry import exp_rotation, inverse
 from services.detector.map_store import MapStore
 from services.detector.model import Views
 from services.evaluate.bench import code_version
+
+if TYPE_CHECKING:
+    from services.mapper.cloud import KeyframeCloud
+    from services.mapper.config import MapperConfig
+    from services.simulator.sensor import RgbdSensor
+    from services.simulator.world import World
 
 Floats = NDArray[np.float64]
 
@@ -34,10 +42,10 @@ _STAMP_NS = 66_666_667
 _SIMULATOR = (
     "services.common.geometry",
     *(f"services.simulator.{name}" for name in (
-        "scene", "planting", "catalogue", "meshes", "world", "render", "sensor", "path", "truth",
+        "scene", "planting", "catalogue", "meshes", "world", "render", "sensor", "models", "path", "truth",
     )),
 )  # fmt: skip
-_FUSION = (
+FUSION_CODE = (
     *_SIMULATOR,
     "services.mapper.cloud",
     "services.mapper.config",
@@ -91,14 +99,14 @@ def scene_cloud(name: str, cache: Path, drift: Drift | None = None) -> SceneClou
     Raises:
         InputError: for an unknown scene.
     """
-    label = json.dumps([name, None if drift is None else repr(drift), code_version(_FUSION)])
+    label = json.dumps([name, None if drift is None else repr(drift), code_version(FUSION_CODE)])
     path, shown = cache / f"cloud-{zlib.crc32(label.encode()):08x}-{name}.npz", _shots_path(name, cache)
     if not path.exists() or not shown.exists():
         shots = _cached_shots(name, cache)
         poses = shots.poses if drift is None else wrong_poses(shots.poses, drift, zlib.crc32(name.encode()))
         store = fuse(shots.depth, poses)
-        _save(path, points=store[0], index=store[1], origins=store[2], rotations=store[3], tan_half=np.array(store[4]))
-    points, index, origins, rotations, tan_half = _load_store(path)
+        save_parts(path, store)
+    points, index, origins, rotations, tan_half = load_parts(path)
     with np.load(shown) as held:  # only the truth is unpacked
         trees = _trees(str(held["trees"]))
     return SceneCloud(name, points, Views(index, origins, rotations, tan_half), trees)
@@ -109,18 +117,29 @@ _Parts = tuple[NDArray[np.float32], NDArray[np.int32], Floats, Floats, tuple[flo
 
 def fuse(depth: NDArray[np.uint16], poses: Floats) -> _Parts:
     """Return points, view index, origins, rotations and field of view of depth images (K, H, W) at poses (K, 4, 4)."""
-    from services.mapper.cloud import keyframe_cloud, pixel_rays
     from services.mapper.config import MapperConfig
-    from services.mapper.dense_map import DenseMap
     from services.simulator.render import DEFAULT_INTRINSICS
 
     config = MapperConfig()
-    dense, rays = DenseMap(config), pixel_rays(DEFAULT_INTRINSICS)
+    return fuse_clouds((as_cloud(image, DEFAULT_INTRINSICS, config) for image in depth), poses, config)
+
+
+def as_cloud(image_mm: NDArray[np.uint16], intrinsics: Intrinsics, config: MapperConfig) -> KeyframeCloud:
+    """Return the mapper's points of a depth image (H, W)."""
+    from services.mapper.cloud import keyframe_cloud, pixel_rays
+
+    return keyframe_cloud(image_mm.astype(np.float32) * np.float32(0.001), None, pixel_rays(intrinsics), config)
+
+
+def fuse_clouds(clouds: Iterable[KeyframeCloud], poses: Floats, config: MapperConfig) -> _Parts:
+    """Return the same parts of keyframes' clouds at poses (K, 4, 4)."""
+    from services.mapper.dense_map import DenseMap
+
+    dense = DenseMap(config)
     dense.reset("bench")
     store = MapStore()
     store.clear("bench")
-    for k, (image, T) in enumerate(zip(depth, poses, strict=True)):
-        cloud = keyframe_cloud(image.astype(np.float32) * np.float32(0.001), None, rays, config)
+    for k, (cloud, T) in enumerate(zip(clouds, poses, strict=True)):
         dense.add(k, k * _STAMP_NS, cloud, T)
     for s in dense.submaps.values():
         store.take(
@@ -198,32 +217,62 @@ def _cached_shots(name: str, cache: Path) -> _Shots:
 
 
 def _render(name: str) -> _Shots:
-    from services.simulator.catalogue import scene_by_name
     from services.simulator.config import SensorConfig
-    from services.simulator.path import map_frame, reference_path, sample
-    from services.simulator.render import DEFAULT_INTRINSICS, Rendering
+    from services.simulator.render import DEFAULT_INTRINSICS
     from services.simulator.sensor import RgbdSensor
+
+    k = DEFAULT_INTRINSICS
+    flight = flown(name)
+    sensor = RgbdSensor(SensorConfig(), (k.height, k.width), seed=zlib.crc32(name.encode()))
+    return _Shots(depth_images(flight, sensor, k), flight.poses, flight.trees)
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """A scene and the keyframes of the reference's path through it."""
+
+    world: World
+    poses_world: tuple[Floats, ...]
+    """T_world_camera (4, 4) of each keyframe."""
+    poses: Floats
+    """(K, 4, 4) T_map_camera, true."""
+    trees: tuple[TrueTree, ...]
+
+
+def flown(name: str) -> Flight:
+    """Return a scene's flight.
+
+    Raises:
+        InputError: for an unknown scene.
+    """
+    from services.simulator.catalogue import scene_by_name
+    from services.simulator.path import map_frame, reference_path, sample
     from services.simulator.truth import fair_trees, truth_trees
     from services.simulator.world import World
 
-    k = DEFAULT_INTRINSICS
     world = World(scene_by_name(name))
     path = reference_path(world.scene, None, world.clearance)
     steps = [T for _, T in sample(path, _RATE_HZ)]
     T_world_map = map_frame(steps[0])
     poses = keyframes(steps)
-    sensor = RgbdSensor(SensorConfig(), (k.height, k.width), seed=zlib.crc32(name.encode()))
+    T_map_world = inverse(T_world_map)
+    placed = np.stack([T_map_world @ T for T in poses])
+    return Flight(world, tuple(poses), placed, truth_trees(world.scene, T_world_map, fair_trees(world, path)))
+
+
+def depth_images(flight: Flight, sensor: RgbdSensor, k: Intrinsics) -> NDArray[np.uint16]:
+    """Return what the sensor measures at each keyframe, (K, H, W) millimetres."""
+    from services.simulator.render import Rendering
+
     u, v = np.meshgrid(np.arange(k.width), np.arange(k.height))
     directions = np.stack([(u - k.cx) / k.fx, (v - k.cy) / k.fy, np.ones(u.shape)], axis=-1)
     colour = np.zeros((k.height, k.width, 3), dtype=np.uint8)
     depth = []
-    for seq, T in enumerate(poses):
+    for seq, T in enumerate(flight.poses_world):
         rays = np.empty((*u.shape, 6), dtype=np.float32)
         rays[..., :3], rays[..., 3:] = T[:3, 3], directions @ T[:3, :3].T
-        depth.append(sensor.expose(Rendering(colour, world.cast(rays).distance), seq).depth)
-    T_map_world = inverse(T_world_map)
-    placed = np.stack([T_map_world @ T for T in poses])
-    return _Shots(np.stack(depth), placed, truth_trees(world.scene, T_world_map, fair_trees(world, path)))
+        depth.append(sensor.expose(Rendering(colour, flight.world.cast(rays).distance), seq).depth)
+    return np.stack(depth)
 
 
 def _save(path: Path, *, small: bool = False, **arrays: NDArray[np.generic]) -> None:
@@ -235,7 +284,14 @@ def _save(path: Path, *, small: bool = False, **arrays: NDArray[np.generic]) -> 
     partial.replace(path)
 
 
-def _load_store(path: Path) -> _Parts:
+def save_parts(path: Path, parts: _Parts) -> None:
+    """Keep what ``fuse`` gave."""
+    points, index, origins, rotations, tan_half = parts
+    _save(path, points=points, index=index, origins=origins, rotations=rotations, tan_half=np.array(tan_half))
+
+
+def load_parts(path: Path) -> _Parts:
+    """Return what ``save_parts`` kept."""
     with np.load(path) as held:
         tan = held["tan_half"]
         return held["points"], held["index"], held["origins"], held["rotations"], (float(tan[0]), float(tan[1]))
