@@ -7,25 +7,25 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 import units
+from actions import Action, Folder, InstallError, Link, Remove, Run, Write
 
 SOURCE = Path(__file__).resolve().parents[1]
 USER = "treedock"
 UNIT_FOLDER = "etc/systemd/system"
 CONFIG = "etc/treedock/10-treedock.toml"
+COMMAND = "usr/local/bin/treedock"
 RULES = "etc/udev/rules.d/60-treedock.rules"
 _MIN_PYTHON = (3, 11)
-
-
-class InstallError(Exception):
-    """What the person at the keyboard has to mend first."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,7 @@ class Options:
     wheels: Path | None
     enable: bool
     purge: bool
+    no_realsense: bool
 
     def at(self, path: str) -> Path:
         """Return where a path of the installed system lies under ``--root``."""
@@ -51,106 +52,10 @@ class Options:
         return self.root == Path("/")
 
 
-@dataclass(frozen=True)
-class Write:
-    """A file with this content."""
-
-    path: Path
-    text: str
-    mode: int = 0o644
-    keep: bool = False
-    """Left as it is when it exists: the administrator's own."""
-
-    def describe(self) -> str:
-        """Return the line for the person who watches."""
-        if self.path.exists() and self.keep:
-            return f"keep    {self.path}"
-        if self.path.is_file() and self.path.read_text() == self.text:
-            return f"same    {self.path}"
-        return f"write   {self.path}"
-
-    def do(self) -> None:
-        """Do it."""
-        if not self.describe().startswith("write"):
-            return
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        fresh = self.path.with_name(self.path.name + ".new")
-        fresh.write_text(self.text)
-        fresh.chmod(self.mode)
-        fresh.replace(self.path)
-
-
-@dataclass(frozen=True)
-class Folder:
-    """A folder."""
-
-    path: Path
-    mode: int = 0o755
-    owner: str = ""
-
-    def describe(self) -> str:
-        """Return the line for the person who watches."""
-        return f"{'same   ' if self.path.is_dir() else 'make   '} {self.path}"
-
-    def do(self) -> None:
-        """Do it."""
-        self.path.mkdir(parents=True, exist_ok=True)
-        self.path.chmod(self.mode)
-        if self.owner:
-            shutil.chown(self.path, self.owner, self.owner)
-
-
-@dataclass(frozen=True)
-class Run:
-    """A command."""
-
-    command: tuple[str, ...]
-    why: str
-    needed: bool = True
-    """False: skipped, because its result is there already."""
-    may_fail: bool = False
-
-    def describe(self) -> str:
-        """Return the line for the person who watches."""
-        return f"{'run    ' if self.needed else 'done   '} {' '.join(self.command)}   ({self.why})"
-
-    def do(self) -> None:
-        """Do it."""
-        if not self.needed:
-            return
-        try:
-            subprocess.run(self.command, check=True)
-        except (OSError, subprocess.CalledProcessError) as error:
-            if not self.may_fail:
-                raise InstallError(
-                    f"{' '.join(self.command)}: {error}; mend that and run deploy/install again"
-                ) from None
-
-
-@dataclass(frozen=True)
-class Remove:
-    """A file or folder that goes."""
-
-    path: Path
-
-    def describe(self) -> str:
-        """Return the line for the person who watches."""
-        return f"{'remove ' if self.path.exists() else 'gone   '} {self.path}"
-
-    def do(self) -> None:
-        """Do it."""
-        if self.path.is_dir() and not self.path.is_symlink():
-            shutil.rmtree(self.path)
-        else:
-            self.path.unlink(missing_ok=True)
-
-
-Action = Write | Folder | Run | Remove
-
-
 def installation(options: Options) -> Iterator[Action]:
     """Yield what makes an installation, in order."""
     if options.live:
+        yield from _libraries()
         yield from _user()
     yield from _environment(options)
     yield Folder(options.at("/etc/treedock"))
@@ -164,6 +69,7 @@ def installation(options: Options) -> Iterator[Action]:
     operations = SOURCE / "docs/operations.md"
     if operations.is_file():
         yield Write(options.at(f"{options.prefix}/share/doc/treedock/operations.md"), operations.read_text())
+    yield Link(options.at(COMMAND), f"{options.prefix}/bin/treedock")
     if options.live:
         yield from _activation(options)
 
@@ -178,6 +84,20 @@ def _user() -> Iterator[Action]:
         yield Folder(Path(folder), 0o750, USER)
 
 
+def _libraries() -> Iterator[Action]:
+    """Yield the system's libraries that the packages link against, where this is a Debian or Ubuntu."""
+    if shutil.which("dpkg-query") is None:
+        return
+    wanted = (SOURCE / "deploy/system-packages.txt").read_text().split()
+    show = ["dpkg-query", "-W", "-f=${db:Status-Status} ${Package} ${Provides}\n"]
+    rows = subprocess.run(show, capture_output=True, text=True, check=False).stdout.splitlines()
+    # a library may have been renamed (libidn2-0t64): what it provides counts too
+    present = " ".join(row.removeprefix("installed ") for row in rows if row.startswith("installed "))
+    missing = tuple(name for name in wanted if not re.search(rf"(^|[ ,]){re.escape(name)}($|[ ,])", present))
+    install = ("apt-get", "install", "-y", "-qq", "--no-install-recommends", *missing)
+    yield Run(install, "system libraries", needed=bool(missing))
+
+
 def _environment(options: Options) -> Iterator[Action]:
     prefix = options.at(options.prefix)
     python = str(prefix / "bin/python")
@@ -188,6 +108,13 @@ def _environment(options: Options) -> Iterator[Action]:
          str(SOURCE / "constraints.txt"), str(SOURCE)),
         "treedock and its pinned packages",
     )  # fmt: skip
+    if options.role == "aircraft" and not options.no_realsense:
+        yield Run(
+            (python, "-m", "pip", "install", "-q", "--disable-pip-version-check", *offline, "-c",
+             str(SOURCE / "constraints.txt"), "pyrealsense2"),
+            "the RealSense camera's library; where there is no wheel (ARM), build librealsense with its Python bindings",
+            may_fail=True,
+        )  # fmt: skip
 
 
 def _activation(options: Options) -> Iterator[Action]:
@@ -213,6 +140,9 @@ def removal(options: Options) -> Iterator[Action]:
     for name in units.files():
         yield Remove(options.at(f"{UNIT_FOLDER}/{name}"))
     yield Remove(options.at(RULES))
+    command = options.at(COMMAND)
+    if command.is_symlink() and str(command.readlink()) == f"{options.prefix}/bin/treedock":
+        yield Remove(command)
     yield Remove(options.at(options.prefix))
     if options.purge:
         for path in ("/etc/treedock", f"/var/lib/{USER}", f"/var/cache/{USER}"):
@@ -231,6 +161,13 @@ def check(options: Options) -> None:
         raise InstallError(
             f"Python {sys.version.split()[0]} is too old, 3.11 is needed: PYTHON=python3.11 deploy/install"
         )
+    home = home_of(Path(sys.executable))
+    if options.live and home:
+        raise InstallError(
+            f"this Python lies in {home}, where the services' user may not look: PYTHON=/usr/bin/python3 deploy/install"
+        )
+    if find_spec("ensurepip") is None:
+        raise InstallError("this Python cannot make environments: apt-get install python3-venv")
     if not options.prefix.startswith("/"):
         raise InstallError(f"--prefix {options.prefix}: expected an absolute path, for example /opt/treedock")
     if options.live and not options.dry_run and os.geteuid() != 0:
@@ -242,6 +179,15 @@ def check(options: Options) -> None:
         raise InstallError(f"--uav {options.uav!r}: letters, digits, _ and - make an aircraft's name")
 
 
+def home_of(python: Path) -> str:
+    """Return the home folder that a Python (or what its links lead to) lies in, empty when it is the system's."""
+    for place in (python.absolute(), python.resolve()):
+        for home in ("/root", "/home", "/Users"):
+            if place.is_relative_to(home):
+                return home
+    return ""
+
+
 def parse(arguments: Sequence[str]) -> tuple[str, Options]:
     """Return the verb and the options."""
     parser = argparse.ArgumentParser(prog="deploy/install", description=__doc__.splitlines()[0] if __doc__ else "")
@@ -251,6 +197,7 @@ def parse(arguments: Sequence[str]) -> tuple[str, Options]:
     parser.add_argument("--uav", default="uav1", help="the aircraft's name, a part of every key (default %(default)s)")
     parser.add_argument("--role", choices=("aircraft", "station"), default="aircraft", help="what --enable starts")
     parser.add_argument("--wheels", type=Path, help="folder of wheels for a machine without a network")
+    parser.add_argument("--no-realsense", action="store_true", help="leave out the RealSense camera's library")
     parser.add_argument("--enable", action="store_true", help="start now and at every boot")
     parser.add_argument("--dry-run", action="store_true", help="show what would be done, do nothing")
     parser.add_argument(
@@ -266,6 +213,7 @@ def parse(arguments: Sequence[str]) -> tuple[str, Options]:
         given.wheels,
         given.enable,
         given.purge,
+        given.no_realsense,
     )
 
 

@@ -31,6 +31,7 @@ Hosts = Annotated[
 ]
 _FOLDER = Path("treedock-certs")
 _DAYS = 397
+_MACHINE_FOLDER = Path("/etc/treedock/certs")
 
 
 @certs_app.command("init")
@@ -74,7 +75,10 @@ def revoke(names: Names, *, folder: Folder = _FOLDER) -> None:
     for name in _expanded(names, authority):
         authority = authority.revoke(Identity.parse(name))
         typer.echo(f"{name}: revoked")
-    typer.echo(f"copy {folder / 'identities.json'} to every router's machine and restart treedock-router there")
+    typer.echo(
+        f"bring the new {folder / 'identities.json'} to every router's machine (certs export and import, or copy it to "
+        "/etc/treedock/certs): the router there takes it within seconds"
+    )
 
 
 @certs_app.command("list")
@@ -110,7 +114,23 @@ def export(
 
     authority = _opened(folder)
     files = authority.export([Identity.parse(name) for name in _expanded(names, authority)], to)
-    typer.echo(f"{len(files)} files in {to}; set security.folder to it and router.protocol to tls")
+    typer.echo(f"{len(files)} files in {to}; on the machine they are for: sudo treedock certs import THAT_FOLDER")
+
+
+@certs_app.command("import")
+def import_(
+    source: Annotated[Path, typer.Argument(help="Folder that `certs export` made, for example on a USB stick.")],
+    *,
+    to: Annotated[Path, typer.Option("--to", help="Where this machine's services look.")] = _MACHINE_FOLDER,
+) -> None:
+    """Check what was exported for this machine and lay it where its services look."""
+    from services.security.machine import bring
+
+    files = bring(source, to, _now())
+    typer.echo(
+        f'{len(files)} files in {to}; security.folder = "{to}" and router.protocol = "tls" make the services use '
+        "them. A router that runs takes a new list by itself"
+    )
 
 
 def _opened(folder: Path) -> Authority:
@@ -148,8 +168,8 @@ def _expanded(names: Sequence[str], authority: Authority | None = None) -> list[
 
 def _next_step(folder: Path) -> str:
     return (
-        f"in {folder}; `treedock certs export NAMES --to FOLDER` collects what a machine needs. A router knows new "
-        "certificates once it has the new identities.json and was restarted"
+        f"in {folder}; `treedock certs export NAMES --to FOLDER` collects what a machine needs. Routers know new "
+        "certificates once they have the new identities.json"
     )
 
 

@@ -56,7 +56,8 @@ def _print(findings: list[Finding]) -> None:
 
 
 def _mended(facts: Facts) -> bool:
-    """Mend keys that others can read, cut recordings and failed units; return whether anything was done."""
+    """Mend keys' rights, cut recordings and failed units; return whether anything was done."""
+    import shutil
     import subprocess
     from pathlib import Path
 
@@ -66,6 +67,10 @@ def _mended(facts: Facts) -> bool:
     for path in facts.loose_keys:
         Path(path).chmod(0o600)
         done.append(f"chmod 600 {path}")
+    for path in facts.foreign_keys:
+        owner = Path(path).parent.stat()
+        shutil.chown(path, owner.st_uid, owner.st_gid)
+        done.append(f"chown {owner.st_uid}:{owner.st_gid} {path}")
     done += [str(recover(Path(path))) for path in facts.recordings_cut]
     for name, state in sorted(facts.units.items()):
         if state == "failed":

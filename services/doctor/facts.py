@@ -43,6 +43,7 @@ def gather(config: TreedockConfig) -> Facts:
         units=_units(),
         certificates=_certificates(folder) if folder else {},
         loose_keys=_loose_keys(folder) if folder else (),
+        foreign_keys=_foreign_keys(folder) if folder else (),
         encrypted=folder is not None,
         reachable_from_outside=_from_outside(config.router.listen_host or config.router.host),
         clock_synchronised=_synchronised(),
@@ -161,6 +162,11 @@ def _certificates(folder: Path) -> dict[str, float]:
 def _loose_keys(folder: Path) -> list[str]:
     others = stat.S_IRWXG | stat.S_IRWXO
     return [str(path) for path in sorted(folder.glob("*.key")) if path.stat().st_mode & others]
+
+
+def _foreign_keys(folder: Path) -> list[str]:
+    paths = sorted(folder.glob("*.key"))
+    return [str(path) for path in paths if path.stat().st_uid != folder.stat().st_uid]
 
 
 def _synchronised() -> bool | None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from services.doctor.aboard import aboard
 from services.doctor.model import Facts, Finding
 
@@ -66,6 +68,15 @@ def _security(f: Facts) -> list[Finding]:
         elif days < EXPIRY_WARN_DAYS:
             found.append(Finding("certificate", "warn", f"{identity} expires in {days:.0f} days", do))
     found += [Finding("keys", "fail", f"{path} can be read by others", f"chmod 600 {path}") for path in f.loose_keys]
+    found += [
+        Finding(
+            "keys",
+            "fail",
+            f"{path} does not belong to the services' user",
+            f"chown --reference={Path(path).parent} {path}",
+        )
+        for path in f.foreign_keys
+    ]
     return found or [Finding("certificates", "ok", f"{len(f.certificates)} valid")]
 
 

@@ -68,6 +68,8 @@ class Facts:
     """Identity to days of validity left."""
     loose_keys: Sequence[str] = ()
     """Private keys that others can read."""
+    foreign_keys: Sequence[str] = ()
+    """Private keys that the owner of their folder, the services' user, may not read."""
     encrypted: bool = False
     reachable_from_outside: bool = False
     clock_synchronised: bool | None = None

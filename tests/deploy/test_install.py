@@ -18,7 +18,8 @@ from services.common.errors import InputError
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "deploy"))
 
-import installer  # noqa: E402 - lies beside the script that runs before anything is installed
+import actions  # noqa: E402 - lies beside the script that runs before anything is installed
+import installer  # noqa: E402
 import units  # noqa: E402
 
 HAS_SYSTEMD = shutil.which("systemd-analyze") is not None
@@ -31,7 +32,7 @@ def options(tmp_path: Path, *arguments: str) -> installer.Options:
 def staged(tmp_path: Path, *arguments: str) -> None:
     """Everything but the environment, which takes minutes and a package index."""
     for action in installer.installation(options(tmp_path, *arguments)):
-        if not isinstance(action, installer.Run):
+        if not isinstance(action, actions.Run):
             action.do()
 
 
@@ -124,6 +125,31 @@ def test_another_prefix_reaches_the_units(tmp_path: Path) -> None:
     staged(tmp_path, "--prefix", "/usr/local/treedock")
     text = (tmp_path / "etc/systemd/system/treedock-slam.service").read_text()
     assert "ExecStart=/usr/local/treedock/bin/treedock slam" in text
+
+
+def test_the_command_is_found_by_name_and_nobody_elses_is_touched(tmp_path: Path) -> None:
+    staged(tmp_path, "--prefix", "/srv/td")
+    command = tmp_path / "usr/local/bin/treedock"
+    assert str(command.readlink()) == "/srv/td/bin/treedock"
+    assert installer.main(["uninstall", "--root", str(tmp_path)]) == 0
+    assert command.is_symlink(), "of another installation"
+    assert installer.main(["uninstall", "--root", str(tmp_path), "--prefix", "/srv/td"]) == 0
+    assert not command.is_symlink()
+    command.write_text("theirs")
+    staged(tmp_path)
+    assert command.read_text() == "theirs"
+
+
+@pytest.mark.parametrize(
+    ("python", "home"),
+    [
+        ("/root/.pyenv/versions/3.11/bin/python3", "/root"),
+        ("/home/eve/venv/bin/python", "/home"),
+        ("/usr/bin/python3", ""),
+    ],
+)
+def test_a_python_that_the_services_may_not_read_is_known(python: str, home: str) -> None:
+    assert installer.home_of(Path(python)) == home
 
 
 def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -89,6 +89,7 @@ def test_a_sound_machine_has_no_trouble() -> None:
         (replace(ENCRYPTED, certificates={"uav1.slam": 12.0}), "certificate", "warn", "12 days"),
         (replace(ENCRYPTED, certificates={"uav1.slam": -3.0}), "certificate", "fail", "3 days ago"),
         (replace(ENCRYPTED, loose_keys=("/etc/x.key",)), "keys", "fail", "/etc/x.key"),
+        (replace(ENCRYPTED, foreign_keys=("/etc/x.key",)), "keys", "fail", "services' user"),
     ],
 )
 def test_each_trouble_has_its_finding_and_what_to_do(facts: Facts, about: str, level: str, word: str) -> None:

@@ -1,0 +1,80 @@
+"""Certificates arrive on a machine: what was exported for it is checked and laid where its services look."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime as dt
+import os
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives import serialization
+
+from services.common.errors import InputError
+from services.common.files import make_folder, write_whole
+from services.security.authority import CA_CERTIFICATE, CA_KEY
+from services.security.identity import Identity
+from services.security.register import Register
+
+
+def bring(source: Path, to: Path, now: dt.datetime) -> list[Path]:
+    """Copy what ``certs export`` put into ``source`` to this machine's folder, after looking at all of it.
+
+    The files belong to the folder's owner afterwards (the services' user), also when an administrator brings them.
+
+    Raises:
+        InputError: something is missing, damaged, expired, revoked or of another authority; nothing was copied then.
+    """
+    if (source / CA_KEY).exists():
+        raise InputError(
+            f"{source / CA_KEY}: the authority's own key may not leave its folder; `treedock certs export` leaves it out"
+        )
+    authority = _certificate(source / CA_CERTIFICATE)
+    valid = Register.read(source).valid_names()
+    names = [CA_CERTIFICATE, Register.FILE]
+    for path in sorted(source.glob("*.pem")):
+        if path.name == CA_CERTIFICATE:
+            continue
+        _check(path, authority, valid, now)
+        names += [path.name, path.with_suffix(".key").name]
+    make_folder(to, 0o700)
+    owner = to.stat()
+    files = []
+    for name in names:
+        write_whole(to / name, (source / name).read_bytes(), 0o600 if name.endswith(".key") else 0o644)
+        with contextlib.suppress(PermissionError):  # only root may give files away, and only root needs to
+            os.chown(to / name, owner.st_uid, owner.st_gid)
+        files.append(to / name)
+    return files
+
+
+def _check(path: Path, authority: x509.Certificate, valid: dict[str, Identity], now: dt.datetime) -> None:
+    certificate = _certificate(path)
+    try:
+        certificate.verify_directly_issued_by(authority)
+    except (InvalidSignature, ValueError, TypeError):
+        raise InputError(f"{path}: is of another authority than the {CA_CERTIFICATE} beside it") from None
+    if certificate.not_valid_after_utc <= now:
+        raise InputError(f"{path}: expired on {certificate.not_valid_after_utc:%Y-%m-%d}; `treedock certs renew` first")
+    name = str(certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)[0].value)
+    if name not in valid:
+        raise InputError(f"{path}: {name} is revoked or not in {Register.FILE}; export it again")
+    key = path.with_suffix(".key")
+    try:
+        private = serialization.load_pem_private_key(key.read_bytes(), password=None)
+    except OSError as error:
+        raise InputError(f"{key}: {error.strerror}; export it again") from error
+    except ValueError as error:
+        raise InputError(f"{key}: damaged ({error}); export it again") from error
+    if private.public_key() != certificate.public_key():
+        raise InputError(f"{key}: does not belong to {path.name}; export both again")
+
+
+def _certificate(path: Path) -> x509.Certificate:
+    try:
+        return x509.load_pem_x509_certificate(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}; `treedock certs export` puts it there") from error
+    except ValueError as error:
+        raise InputError(f"{path}: damaged ({error}); export it again") from error

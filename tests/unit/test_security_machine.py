@@ -1,0 +1,95 @@
+"""Certificates on their way to a machine: only a whole, valid set of one authority arrives."""
+
+from __future__ import annotations
+
+import datetime as dt
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from services.cli.app import invoke
+from services.common.errors import InputError
+from services.security.authority import Authority
+from services.security.identity import Identity
+from services.security.machine import bring
+
+NOW = dt.datetime(2026, 11, 1, tzinfo=dt.UTC)
+SLAM, CAMERA = Identity.parse("uav1.slam"), Identity.parse("uav1.camera")
+
+
+@pytest.fixture
+def stick(tmp_path: Path) -> Path:
+    """What was exported for a machine with two services."""
+    authority = Authority.create(tmp_path / "fleet", NOW).issue(SLAM, NOW).issue(CAMERA, NOW)
+    authority.export([SLAM, CAMERA], tmp_path / "stick")
+    return tmp_path / "stick"
+
+
+def test_a_sound_set_arrives_whole_and_closed_to_others(stick: Path, tmp_path: Path) -> None:
+    files = bring(stick, tmp_path / "certs", NOW)
+    assert {path.name for path in files} == {path.name for path in stick.iterdir()}
+    assert all(path.read_bytes() == (stick / path.name).read_bytes() for path in files)
+    assert all(path.stat().st_mode & 0o077 == 0 for path in files if path.suffix == ".key")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
+def test_what_root_brings_belongs_to_the_services_user(stick: Path, tmp_path: Path) -> None:
+    (tmp_path / "certs").mkdir()
+    os.chown(tmp_path / "certs", 4711, 4711)
+    assert {path.stat().st_uid for path in bring(stick, tmp_path / "certs", NOW)} == {4711}
+
+
+def _other_authority(stick: Path) -> None:
+    other = Authority.create(stick.parent / "other", NOW).issue(SLAM, NOW)
+    shutil.copy(other.folder / "uav1.slam.pem", stick)
+
+
+def _swapped(stick: Path) -> None:
+    shutil.copy(stick / "uav1.camera.key", stick / "uav1.slam.key")
+
+
+def _revoked(stick: Path) -> None:
+    fleet = stick.parent / "fleet"
+    Authority.open(fleet).revoke(SLAM)
+    shutil.copy(fleet / "identities.json", stick)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda stick: (stick / "ca.key").write_text("secret"), "authority's own key"),
+        (lambda stick: (stick / "ca.pem").unlink(), r"ca\.pem"),
+        (lambda stick: (stick / "identities.json").unlink(), r"identities\.json"),
+        (lambda stick: (stick / "uav1.slam.key").unlink(), r"uav1\.slam\.key"),
+        (lambda stick: (stick / "uav1.slam.key").write_text("x"), "damaged"),
+        (lambda stick: (stick / "uav1.slam.pem").write_text("x"), "damaged"),
+        (_other_authority, "another authority"),
+        (_swapped, "does not belong"),
+        (_revoked, "revoked"),
+    ],
+)
+def test_an_unsound_set_is_refused_and_nothing_changes(
+    stick: Path, tmp_path: Path, spoil: Callable[[Path], object], words: str
+) -> None:
+    spoil(stick)
+    with pytest.raises(InputError, match=words):
+        bring(stick, tmp_path / "certs", NOW)
+    assert not (tmp_path / "certs").exists()
+
+
+def test_what_has_expired_is_refused(stick: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="expired"):
+        bring(stick, tmp_path / "certs", NOW + dt.timedelta(days=400))
+
+
+def test_the_command_says_what_comes_next(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fleet, stick, certs = (str(tmp_path / name) for name in ("fleet", "stick", "certs"))
+    assert invoke(["certs", "init", "--folder", fleet]) == 0
+    assert invoke(["certs", "issue", "uav1.slam", "--folder", fleet]) == 0
+    assert invoke(["certs", "export", "uav1.slam", "--folder", fleet, "--to", stick]) == 0
+    assert "certs import" in capsys.readouterr().out
+    assert invoke(["certs", "import", stick, "--to", certs]) == 0
+    assert 'protocol = "tls"' in capsys.readouterr().out
