@@ -32,21 +32,23 @@ class Unit:
     state: str = "treedock"
     ground: bool = False
     """Of the ground station, not aboard."""
-    more: tuple[str, ...] = ()
+    calls: tuple[str, ...] = ()
+    """System calls beyond those that all services may make."""
 
 
 UNITS: tuple[Unit, ...] = (
     Unit("router", "the Zenoh router that all nodes meet at", 500, 300),
-    Unit("camera", "frames from the depth camera", 400, 800, devices=("char-video4linux rw", "char-usb_device rw", "char-media rw"),
+    Unit("camera", "frames from the depth camera", 400, 800, compiles=True, devices=("char-video4linux rw", "char-usb_device rw", "char-media rw"),
          groups=("video", "plugdev")),
-    Unit("slam", "the camera's pose for each frame", 900, 1200, compiles=True),
+    # mapping gives way to tracking: a thread may lower its own priority, not raise it
+    Unit("slam", "the camera's pose for each frame", 900, 1200, compiles=True, calls=("setpriority",)),
     Unit("mapper", "the dense map", 200, 1500, compiles=True),
     Unit("detector", "trees in the map", 200, 1200, compiles=True),
     Unit("refiner", "the target tree at frame rate", 600, 600, compiles=True),
-    Unit("navigator", "the mission", 800, 600, compiles=True),
-    Unit("autopilot", "the bridge to PX4", 1000, 300, compiles=True,
+    Unit("navigator", "the mission", 800, 600),
+    Unit("autopilot", "the bridge to PX4", 1000, 300,
          devices=("char-ttyACM rw", "char-ttyUSB rw", "char-ttyAMA rw", "char-ttyS rw"), groups=("dialout",)),
-    Unit("preview", "a small picture for the ground", 50, 400),
+    Unit("preview", "a small picture for the ground", 50, 400, compiles=True),
     Unit("recorder", "everything worth keeping, into MCAP files", 80, 600, state="treedock treedock/recordings"),
     Unit("station", "the ground station's page and inventory", 100, 800, ground=True, state="treedock treedock/inventory"),
 )  # fmt: skip
@@ -93,6 +95,7 @@ def service_text(unit: Unit, prefix: str = PREFIX) -> str:
         if unit.devices
         else "PrivateDevices=yes\nDevicePolicy=closed\n"
     )
+    calls = f"SystemCallFilter={' '.join(unit.calls)}\n" if unit.calls else ""
     memory = "" if unit.compiles else "MemoryDenyWriteExecute=yes\n"
     return f"""\
 # made by deploy/units.py: change the table there, not this file
@@ -125,8 +128,8 @@ LimitMEMLOCK=infinity
 CPUWeight={unit.cpu_weight}
 MemoryMax={unit.memory_mb}M
 OOMPolicy=stop
-{"".join(line + chr(10) for line in unit.more)}
-{_HARDENING}{memory}{devices}
+
+{_HARDENING}{calls}{memory}{devices}
 [Install]
 WantedBy={target}
 """

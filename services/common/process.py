@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import gc
 import os
 import signal
+import threading
 from pathlib import Path
 
 _PR_SET_PDEATHSIG = 1
@@ -38,3 +40,12 @@ def started() -> None:
 def die_with_parent() -> None:
     """Have the kernel send SIGTERM when the process that started this one ends (Linux; man prctl)."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGTERM))
+
+
+def give_way(nice: int) -> None:
+    """Let the calling thread run after others where the processor is short (Linux: niceness is per thread).
+
+    A sandbox may forbid it: the work is done all the same, only not last.
+    """
+    with contextlib.suppress(PermissionError):
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)

@@ -260,16 +260,18 @@ def _serve(context: LiveContext, build: Build, stop: StopSignal) -> int:
         context.bus.count_overflows()
         health = reporter.report(context.wall.now_ns(), context.bus.passed, state, waiting)
         context.publish(HEALTH, health, context.service)
-        sd_notify.notify("WATCHDOG=1")
+        if overdue is not None:
+            # only once ready: the first kick arms the watchdog, and kernels may take longer to load than it waits
+            sd_notify.notify("WATCHDOG=1")
 
     report("starting")
     context.follow_simulated_clock()
     build(context)
-    overdue = Overdue(context)
     context.every_wall(_HEALTH_PERIOD_NS * 1e-9, report)
     context.bus.declare_live(context.service)
     stop.when_set(context.inbox.wake)
     started()
+    overdue = Overdue(context)
     sd_notify.notify("READY=1")
     LOG.info("ready")
     report()

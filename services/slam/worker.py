@@ -9,13 +9,14 @@ Frames add keyframes and points; only jobs end or merge them: what a job has cop
 from __future__ import annotations
 
 import logging
-import os
 import queue
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Protocol
+
+from services.common.process import give_way
 
 LOG = logging.getLogger(__name__)
 
@@ -158,8 +159,7 @@ class Beside:
         self._thread.join(_CLOSE_S)
 
     def _run(self) -> None:
-        if hasattr(os, "setpriority"):
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        give_way(_NICE)
         while (job := self._jobs.get()) is not None:
             try:
                 job()

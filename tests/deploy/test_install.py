@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import shutil
 import subprocess
 import sys
@@ -60,6 +61,35 @@ def test_every_unit_is_supervised_as_decided(unit: units.Unit) -> None:
         assert f"\n{line}\n" in text
     assert ("DeviceAllow=" in text) == (unit.name in {"camera", "autopilot"}), "devices only where needed"
     assert ("MemoryDenyWriteExecute" in text) != unit.compiles
+
+
+def imported_by(module: str, seen: set[str]) -> None:
+    """Add to ``seen`` what a module of ours imports, at once or later, directly or through others of ours."""
+    place = ROOT.joinpath(*module.split("."))
+    file = next((path for path in (place.with_suffix(".py"), place / "__init__.py") if path.exists()), None)
+    if module in seen or file is None:
+        seen.add(module)
+        return
+    seen.add(module)
+    for node in ast.walk(ast.parse(file.read_text())):
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        for name in names:
+            if name.startswith(("services.", "schemas.")):
+                imported_by(name, seen)
+            else:
+                seen.add(name.partition(".")[0])
+
+
+@pytest.mark.parametrize("unit", units.UNITS, ids=lambda unit: unit.name)
+def test_a_service_with_kernels_may_run_the_code_it_makes_and_no_other_may(unit: units.Unit) -> None:
+    """MemoryDenyWriteExecute would end such a service at its first kernel, or leave another less guarded than it could be."""
+    modules = {"refiner": "services.detector.refine.service", "autopilot": "services.navigator.autopilot.service"}
+    seen: set[str] = set()
+    imported_by(modules.get(unit.name, f"services.{unit.name}.service"), seen)
+    assert "schemas.topics" in seen
+    assert unit.compiles == ("numba" in seen)
 
 
 @pytest.mark.skipif(not HAS_SYSTEMD, reason="systemd-analyze is not installed")

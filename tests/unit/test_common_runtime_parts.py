@@ -22,6 +22,7 @@ from services.common.health import HealthReporter
 from services.common.inbox import Inbox
 from services.common.logging import Throttle, set_up
 from services.common.memory import Hub
+from services.common.process import give_way
 from services.common.session import free_port, port_is_free, split_endpoint
 
 
@@ -164,3 +165,13 @@ def test_the_hub_stops_services_once_and_knows_its_listeners() -> None:
     assert calls == ["tick", "tick", "stopped"]
     assert context.listened(TREES_LIST)
     assert not context.listened(SLAM_POSE)
+
+
+def test_a_sandbox_that_forbids_priorities_stops_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    """systemd's filter of resource calls answers EPERM: the mapping thread of slam ended at its first line."""
+
+    def forbidden(*_: int) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr("os.setpriority", forbidden)
+    give_way(5)
