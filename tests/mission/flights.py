@@ -78,17 +78,11 @@ class Watched:
                 return self.now_ns
         raise AssertionError(f"no process of {service}")
 
-    def speed_m_s(self, after_ns: int) -> list[tuple[float, float]]:
-        """Return seconds since ``after_ns`` and true speed, over pairs of frames 0.2 s apart."""
-        out = []
-        for i, late in enumerate(self.truths):
-            early = next((t for t in self.truths[max(0, i - 6) : i] if late.stamp_ns - t.stamp_ns <= 210_000_000), None)
-            if early is None or late.stamp_ns < after_ns:
-                continue
-            way = np.subtract(late.T_map_camera.position_m, early.T_map_camera.position_m)
-            speed = float(np.linalg.norm(way)) / ((late.stamp_ns - early.stamp_ns) * 1e-9)
-            out.append(((late.stamp_ns - after_ns) * 1e-9, speed))
-        return out
+    def path(self, after_ns: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return seconds since ``after_ns`` (n,) and the camera's true places from above (n, 2), m, frame by frame."""
+        late = [t for t in self.truths if t.stamp_ns >= after_ns]
+        times_s = np.array([(t.stamp_ns - after_ns) * 1e-9 for t in late])
+        return times_s, np.array([t.T_map_camera.position_m[:2] for t in late]).reshape(-1, 2)
 
     def result(self, timeout_s: float = 400.0) -> tuple[int, dict[str, Any], str]:
         """Wait for the end: exit code, summary, what was said on stderr."""
