@@ -18,6 +18,7 @@ from schemas.mapping import GroundPatch, MapIndex, Submap
 from schemas.navigation import Guidance, MissionState
 from schemas.preview import PreviewImage
 from schemas.simulation import SimClock, SimTruth
+from schemas.sketch import SubmapSketch
 from schemas.slam import Graph, Keyframe, Pose
 from schemas.trees import Target, TreeList
 from schemas.vehicle import VehicleState
@@ -106,6 +107,8 @@ SLAM_GRAPH = Topic("slam/graph", Graph, "slam", ("mapper",), 0, None, _A, _ADVAN
                    description="all keyframe poses after a correction")  # fmt: skip
 MAP_CLOUD = Topic("map/cloud", Submap, "mapper", ("detector",), 0, None, _A, _STREAM, "data_low",
                   description="submaps as they change; a queryable answers with the whole map")  # fmt: skip
+MAP_SKETCH = Topic("map/sketch", SubmapSketch, "mapper", ("station",), 0, None, _R, _STREAM, "background", recorded=False,
+                   description="submaps thinned for the 3D view over the radio, sent only while somebody looks; a queryable answers with the whole")  # fmt: skip
 MAP_INDEX = Topic("map/index", MapIndex, "mapper", ("detector",), 0, None, _A, _LATEST, "data_low",
                   description="what the map holds: who holds less has missed a delta")  # fmt: skip
 MAP_GROUND = Topic("map/ground", GroundPatch, "mapper", ("recorder",), 0, None, _A, _STREAM, "data_low",
@@ -136,7 +139,7 @@ SIM_TRUTH = Topic("sim/truth", SimTruth, "simulator", ("evaluate",), 15, None, _
                   description="true pose and trees: benchmarks and summaries only")  # fmt: skip
 
 TOPICS: tuple[Topic, ...] = (
-    CAMERA_RGBD, CAMERA_COMPRESSED, SLAM_POSE, SLAM_KEYFRAME, SLAM_GRAPH, MAP_CLOUD, MAP_INDEX, MAP_GROUND, TREES_LIST, TREES_TARGET,
+    CAMERA_RGBD, CAMERA_COMPRESSED, SLAM_POSE, SLAM_KEYFRAME, SLAM_GRAPH, MAP_CLOUD, MAP_SKETCH, MAP_INDEX, MAP_GROUND, TREES_LIST, TREES_TARGET,
     MISSION_STATE, MISSION_GUIDANCE, VEHICLE_STATE, COMMAND, COMMAND_NONCE, PREVIEW_IMAGE, HEALTH, SIM_RGBD, SIM_CLOCK, SIM_TRUTH,
 )  # fmt: skip
 

@@ -12,6 +12,7 @@ from schemas.mapping import GroundCell, GroundPatch, MapIndex, Submap
 from schemas.navigation import Guidance, MissionState, Setpoint
 from schemas.preview import PreviewImage
 from schemas.simulation import SimClock, SimTruth, TrueTree
+from schemas.sketch import SubmapSketch
 from schemas.slam import Graph, GraphNode, Keyframe, Pose, Transform
 from schemas.trees import Target, Tree, TreeList
 from schemas.vehicle import VehicleState
@@ -50,6 +51,12 @@ def submap() -> Submap:
     return Submap("map-1", 5, 2, 9, 66_000_000, T, points, view, origins, colour)
 
 
+def sketch() -> SubmapSketch:
+    """Return a small sketch of a submap."""
+    points = np.arange(-3, 3, dtype=np.int16).reshape(2, 3)
+    return SubmapSketch("map-1", 5, 2, 66_000_000, submap().T_map_submap, points, submap().colour)
+
+
 def all_messages() -> dict[str, Wire]:
     """Return an example of every message by its schema's name."""
     setpoint = Setpoint(position_m=(0.0, 0.0, 1.5), yaw_rad=0.3, velocity_m_s=(0.1, 0.0, 0.0), yaw_rate_rad_s=0.4)
@@ -57,6 +64,7 @@ def all_messages() -> dict[str, Wire]:
     examples: list[Wire] = [
         frame(),
         submap(),
+        sketch(),
         MapIndex(stamp_ns=66_000_000, map_id="map-1", epoch=1, graph_version=9, submap_ids=(5,), versions=(2,), placed_by=(9,),
                  ground_sequence=4),
         GroundPatch(stamp_ns=66_000_000, map_id="map-1", graph_version=9, sequence=4, cell_m=0.5, gone=((3, -2),), cells=(

@@ -12,7 +12,10 @@ Host = Annotated[
     str | None, typer.Option("--host", help="Where the page is served; others than this machine need a token.")
 ]
 PagePort = Annotated[int | None, typer.Option("--page-port", help="The page's port; 0: any.", min=0, max=65535)]
-Cloud = Annotated[bool, typer.Option("--cloud", help="The point cloud too, where the aircraft's network reaches here.")]
+Cloud = Annotated[
+    bool,
+    typer.Option("--cloud/--no-cloud", help="Let the 3D view ask for the point cloud: up to 48 KB a submap by radio."),
+]
 Browser = Annotated[bool, typer.Option("--browser", help="Open the page in a browser.")]
 
 
@@ -20,7 +23,7 @@ def station(
     *,
     host: Host = None,
     page_port: PagePort = None,
-    cloud: Cloud = False,
+    cloud: Cloud = True,
     browser: Browser = False,
     config: ConfigFile = None,
     settings: Settings = None,
@@ -35,8 +38,8 @@ def station(
         end_with(parent)
     flags: dict[str, object] = {"station.host": host, "station.port": page_port}
     more = {key: value for key, value in flags.items() if value is not None}
-    if cloud:
-        more["station.cloud"] = True
+    if not cloud:
+        more["station.cloud"] = False
     if sim_clock:
         more["clock"] = "sim"
     if browser:

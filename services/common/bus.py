@@ -60,6 +60,7 @@ class Bus:
         """Monotonic time of the last sample per subscribed topic name."""
         self._publishers: dict[str, _Publisher] = {}
         self._kept: list[object] = []
+        self._subscribers: dict[str, list[Any]] = {}
         self._last_seq: dict[str, int] = {}
         self._throttle = Throttle()
         self._boxes: dict[str, Mailbox] = {}
@@ -151,7 +152,15 @@ class Bus:
             )  # fmt: skip
         else:
             subscriber = self.session.declare_subscriber(key, direct)
-        self._kept.append(subscriber)
+        self._subscribers.setdefault(topic.name, []).append(subscriber)
+
+    def unsubscribe(self, topic: Topic) -> None:
+        """End the subscriptions to a topic: for what is sent only while somebody listens."""
+        for subscriber in self._subscribers.pop(topic.name, []):
+            subscriber.undeclare()
+        box = self._boxes.pop(topic.name, None)
+        if box is not None:
+            self.inbox.close(box)
 
     def _receive(self, topic: Topic, sample: zenoh.Sample) -> Wire | None:
         """Return the sample's message, or None after counting what is wrong with it."""

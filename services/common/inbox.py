@@ -39,9 +39,18 @@ class Inbox:
         self._boxes.append(box)
         return box
 
+    def close(self, box: Mailbox) -> None:
+        """Take a mailbox away with what is in it."""
+        with self._ready:
+            self._boxes.remove(box)
+            box.items.clear()
+            box.capacity = 0
+
     def put(self, box: Mailbox, item: object) -> None:
         """Drop an item into ``box``; the oldest makes room when it is full."""
         with self._ready:
+            if box.capacity == 0:
+                return
             if len(box.items) >= box.capacity:
                 box.items.popleft()
                 box.overflowed += 1

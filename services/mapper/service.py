@@ -17,7 +17,7 @@ from schemas.camera import Intrinsics
 from schemas.codec import Wire
 from schemas.mapping import MapIndex
 from schemas.slam import Graph, Keyframe, Transform
-from schemas.topics import MAP_CLOUD, MAP_GROUND, MAP_INDEX, SLAM_GRAPH, SLAM_KEYFRAME
+from schemas.topics import MAP_CLOUD, MAP_GROUND, MAP_INDEX, MAP_SKETCH, SLAM_GRAPH, SLAM_KEYFRAME
 from services.camera.codecs import FrameError, decode_colour_image, decode_depth
 from services.common.context import Context
 from services.common.geometry import from_transform, inverse
@@ -29,6 +29,7 @@ from services.mapper.ground_patches import GroundPatches, Occasion
 from services.mapper.keeper import MapKeeper
 from services.mapper.local_submap import LocalSubmap
 from services.mapper.saved_map import SavedMap, as_message, map_file
+from services.mapper.sketch import sketch_of
 
 Matrix = NDArray[np.float64]
 
@@ -65,6 +66,7 @@ class MapperService:
         context.on(SLAM_GRAPH, self.on_graph)
         context.every(_LOOK_S, self.on_timer)
         context.answer_state(MAP_CLOUD, self.whole_map)
+        context.answer_state(MAP_SKETCH, self.whole_sketch)
         context.answer_state(MAP_GROUND, lambda: list(self._ground.whole(self._occasion())))
         if self._keeper is not None:
             context.every_wall(config.save_s, self._save_now_and_then)
@@ -152,6 +154,10 @@ class MapperService:
         version = self._graph_version
         return [as_message(s, self.map.map_id, version, points=True) for s in self.map.submaps.values() if len(s.points_m)]  # fmt: skip
 
+    def whole_sketch(self) -> list[Wire]:
+        """Return every submap as the radio carries it."""
+        return [sketch_of(s, self.map.map_id, points=True) for s in self.map.submaps.values() if len(s.points_m)]
+
     def _add(
         self,
         keyframe: Keyframe,
@@ -200,8 +206,11 @@ class MapperService:
         self._held_back = []
         if self._saved is not None and self._saved.map_id != map_id:
             self._saved = None
+        looked_at = self._context.listened(MAP_SKETCH)
         for submap in gone:
             self._context.publish(MAP_CLOUD, as_message(submap, old, 0, points=False, removed=True))
+            if looked_at:
+                self._context.publish(MAP_SKETCH, sketch_of(submap, old, points=False, removed=True))
 
     def _restore(self, poses: Mapping[int, Matrix]) -> None:
         """Take up the saved map when slam still works on it: the same name, a later graph, most keyframes still in it."""
@@ -244,6 +253,7 @@ class MapperService:
         self._ground.model.touch(submaps)
         self._news |= bool(submaps)
         self._unsaved |= bool(submaps)
+        looked_at = bool(submaps) and self._context.listened(MAP_SKETCH)
         for submap in submaps:
             if len(submap.points_m) == 0 and (not points or submap.version == 1):
                 continue
@@ -254,6 +264,8 @@ class MapperService:
                 MAP_CLOUD,
                 as_message(submap, self.map.map_id, self._graph_version, points=points, removed=removed),
             )
+            if looked_at:
+                self._context.publish(MAP_SKETCH, sketch_of(submap, self.map.map_id, points=points, removed=removed))
 
     def _save(self) -> bool:
         assert self._keeper is not None

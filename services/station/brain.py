@@ -180,7 +180,10 @@ class Brain:
     def _wish_cloud(self, page: int, session: Session, request: Cloud) -> None:
         if not self.config.cloud:
             self._reply(
-                page, request.id, accepted=False, reason="the cloud is not served: start the station with --cloud"
+                page,
+                request.id,
+                accepted=False,
+                reason="the cloud is not served: this station was started with --no-cloud",
             )
             return
         session.cloud_of = request.uav if request.on and request.uav in self.fleet else ""

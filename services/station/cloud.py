@@ -1,7 +1,7 @@
-"""The point cloud on its way to the 3D view: placed, thinned to a bound, packed. Pure.
+"""The point cloud on its way to the 3D view: which submaps a page holds, how many points of each. Pure.
 
-Its key reaches the aircraft's network and not the radio, so the station asks for it only when it is told that it may
-(``station.cloud``) and only while a page looks at it.
+It comes as ``map/sketch``, asked for only while a page looks at it. The points of a sketch are in an order in which
+every first part is an even sample, so thinning is taking fewer.
 """
 
 from __future__ import annotations
@@ -9,56 +9,50 @@ from __future__ import annotations
 import struct
 
 import numpy as np
-from numpy.typing import NDArray
 
-from schemas.mapping import Submap
+from schemas.sketch import SubmapSketch
 
 MAX_POINTS = 300_000
-_HEAD = struct.Struct("<III")
+"""About so many points of one aircraft go to a page (4.5 MB)."""
+_HEAD = struct.Struct("<III12f")
+_POINTS, _REMOVED, _MOVED = 0, 1, 2
 
 
 class CloudView:
-    """The newest submaps of one aircraft, each as a page's frame."""
+    """The submaps of one aircraft, each as a frame for the page."""
 
     def __init__(self, uav: str, max_points: int = MAX_POINTS) -> None:
         self._uav = uav
         self._max_points = max_points
-        self._counts: dict[int, int] = {}
+        self._held: set[int] = set()
         self.map_id = ""
 
-    def take(self, submap: Submap) -> list[tuple[str, bytes]]:
-        """Return frames with their keys: the submap, thinned when all together would be too many.
+    def take(self, sketch: SubmapSketch) -> list[tuple[str, bytes]]:
+        """Return frames with their keys, of which a later one replaces an earlier that still waits.
 
-        The first of a new map also withdraws those of the old one.
+        The first of a new map also withdraws the submaps of the old one. A place for points that were never seen is
+        passed over: they come with the answer of the whole, which has the place too.
         """
         frames = []
-        if submap.map_id != self.map_id:
-            frames = [self._frame(number, None) for number in self._counts]
-            self._counts.clear()
-            self.map_id = submap.map_id
-        if submap.removed or not len(submap.points_m):
-            self._counts.pop(submap.submap_id, None)
-            return [*frames, self._frame(submap.submap_id, None)]
-        share = max(1, len(self._counts.keys() | {submap.submap_id}))
-        step = max(1, -(-len(submap.points_m) * share // self._max_points))
-        others = sum(count for number, count in self._counts.items() if number != submap.submap_id)
-        keep = slice(None, None, step)
-        room = max(0, self._max_points - others)
-        points = submap.points_m[keep][:room].astype(np.float64)
-        placed = points @ submap.T_map_submap[:3, :3].T + submap.T_map_submap[:3, 3]
-        colours = submap.colour[keep][:room] if len(submap.colour) else _by_height(placed)
-        self._counts[submap.submap_id] = len(placed)
-        body = placed.astype("<f4").tobytes() + np.ascontiguousarray(colours, dtype=np.uint8).tobytes()
-        return [*frames, self._frame(submap.submap_id, (len(placed), body))]
+        if sketch.map_id != self.map_id:
+            frames = [self._frame(number, _REMOVED, b"") for number in sorted(self._held)]
+            self._held.clear()
+            self.map_id = sketch.map_id
+        number = sketch.submap_id
+        if sketch.removed:
+            known = number in self._held
+            self._held.discard(number)
+            return [*frames, self._frame(number, _REMOVED, b"")] if known else frames
+        if sketch.moved:
+            return [*frames, self._frame(number, _MOVED, b"", sketch)] if number in self._held else frames
+        self._held.add(number)
+        room = max(1, self._max_points // len(self._held))
+        points = np.ascontiguousarray(sketch.points_cm[:room], dtype="<i2").tobytes()
+        return [*frames, self._frame(number, _POINTS, points + sketch.colour[:room].tobytes(), sketch)]
 
-    def _frame(self, number: int, body: tuple[int, bytes] | None) -> tuple[str, bytes]:
+    def _frame(self, number: int, kind: int, body: bytes, sketch: SubmapSketch | None = None) -> tuple[str, bytes]:
         name = self._uav.encode()
-        count, points = body or (0, b"")
-        head = b"C" + bytes([len(name)]) + name + _HEAD.pack(number % 2**32, int(body is None), count)
-        return f"cloud/{self._uav}/{number}", head + points
-
-
-def _by_height(points_m: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Return colours (N, 3) from brown at the ground to green at 3 m."""
-    share = np.clip((points_m[:, 2:3] + 0.2) / 3.2, 0.0, 1.0)
-    return np.asarray((1.0 - share) * [139, 106, 72] + share * [58, 158, 92], dtype=np.uint8)
+        T = np.eye(4) if sketch is None else sketch.T_map_submap
+        head = b"C" + bytes([len(name)]) + name + _HEAD.pack(number % 2**32, kind, len(body) // 9, *T[:3].ravel())
+        # a new place must not take the place of points that still wait
+        return f"cloud/{self._uav}/{number}" + ("/at" if kind == _MOVED else ""), head + body

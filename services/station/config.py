@@ -44,8 +44,8 @@ class StationConfig(BaseModel):
     """Write the page's address into this file once it is served."""
     open_browser: bool = False
     """Open the page in this machine's browser at the start."""
-    cloud: bool = False
-    """Show the point cloud in the 3D view: its key reaches the aircraft's network, not the radio."""
+    cloud: bool = True
+    """Let pages see the point cloud in the 3D view: the radio carries it (``map/sketch``) while one looks, and only then."""
     inventory: InventoryConfig = InventoryConfig()
 
     @property

@@ -23,11 +23,11 @@ import zenoh
 from schemas.command import CommandReply
 from schemas.envelope import Message
 from schemas.health import Health
-from schemas.mapping import Submap
 from schemas.preview import PreviewImage
+from schemas.sketch import SubmapSketch
 from schemas.topics import (
     HEALTH,
-    MAP_CLOUD,
+    MAP_SKETCH,
     MISSION_STATE,
     PREFIX,
     PREVIEW_IMAGE,
@@ -197,36 +197,42 @@ class Station:
         self._context.health.count("messages")
         self.site.latest(f"preview/{aircraft.uav}", frame_of(aircraft.uav, message.jpeg))
 
-    # -- the cloud, where it reaches here and while somebody looks
+    # -- the cloud, while somebody looks
 
     def _on_cloud_wish(self, uav: str) -> None:
         """Ask for the whole map; follow its changes from then on."""
         bus = self._buses[uav]
         if uav not in self._clouds:
             self._clouds[uav] = CloudView(uav)
-            bus.subscribe(MAP_CLOUD, functools.partial(self._on_submap, uav))
+            bus.subscribe(MAP_SKETCH, functools.partial(self._on_sketch, uav))
 
         def ask() -> None:
             held: set[int] = set()
             for _ in range(
                 _CLOUD_ASKS
             ):  # big answers are dropped where the network is full: asked for until none is new
-                found = bus.ask(MAP_CLOUD, None, Submap, _CLOUD_TIMEOUT_S)
+                found = bus.ask(MAP_SKETCH, None, SubmapSketch, _CLOUD_TIMEOUT_S)
                 fresh = [submap for submap in found if submap.submap_id not in held]
                 for submap in fresh:
-                    self.call(functools.partial(self._on_submap, uav, submap))
+                    self.call(functools.partial(self._on_sketch, uav, submap))
                 if not fresh:
                     return
                 held |= {submap.submap_id for submap in fresh}
 
         self._pool.submit(ask)
 
-    def _on_submap(self, uav: str, submap: Submap) -> None:
+    def _on_sketch(self, uav: str, sketch: SubmapSketch) -> None:
         pages = self.brain.cloud_watchers(uav)
-        if pages:
-            for key, frame in self._clouds[uav].take(submap):
+        if pages and uav in self._clouds:
+            for key, frame in self._clouds[uav].take(sketch):
                 for page in pages:
                     self.site.one(page, frame, key)
+
+    def _end_unwatched_clouds(self) -> None:
+        """Stop listening to what no page looks at: the radio has better to carry."""
+        for uav in [uav for uav in self._clouds if not self.brain.cloud_watchers(uav)]:
+            self._buses[uav].unsubscribe(MAP_SKETCH)
+            del self._clouds[uav]
 
     # -- orders
 
@@ -247,6 +253,7 @@ class Station:
 
     def _each_second(self) -> None:
         self.brain.tell_trees()
+        self._end_unwatched_clouds()
         passed: Counter[str] = Counter()
         for bus in self._buses.values():
             bus.count_overflows()

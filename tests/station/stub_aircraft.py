@@ -14,12 +14,12 @@ import numpy as np
 
 from schemas.command import Command, CommandName, CommandReply, NonceReply, NonceRequest
 from schemas.health import Health
-from schemas.mapping import Submap
+from schemas.sketch import SubmapSketch
 from schemas.topics import (
     COMMAND,
     COMMAND_NONCE,
     HEALTH,
-    MAP_CLOUD,
+    MAP_SKETCH,
     MISSION_STATE,
     SLAM_POSE,
     TREES_LIST,
@@ -57,8 +57,8 @@ def forest(seed: int) -> list[Tree]:
     return found
 
 
-def cloud_of(trees: list[Tree], seed: int, points: int = 300_000) -> list[Submap]:
-    """The ground and the trunks as a cloud of twelve submaps."""
+def cloud_of(trees: list[Tree], seed: int, points: int = 300_000) -> list[SubmapSketch]:
+    """The ground and the trunks as a cloud of sixty submaps, brown below and green above."""
     rng = np.random.default_rng(seed)
     ground = np.column_stack([rng.uniform(-9.0, 9.0, (points // 2, 2)), rng.normal(-0.1, 0.02, points // 2)])
     each = (points - len(ground)) // len(trees)
@@ -67,11 +67,15 @@ def cloud_of(trees: list[Tree], seed: int, points: int = 300_000) -> list[Submap
         turn, height = rng.uniform(0.0, 2.0 * np.pi, each), rng.uniform(0.0, 2.5, each)
         r = t.radius_m + rng.normal(0.0, 0.006, each)
         parts.append(np.column_stack([t.x_m + r * np.cos(turn), t.y_m + r * np.sin(turn), t.z_m + height]))
-    cloud = rng.permutation(np.concatenate(parts)).astype(np.float32)
+    cloud = rng.permutation(np.concatenate(parts))
+    share = np.clip((cloud[:, 2:3] + 0.2) / 2.7, 0.0, 1.0)
+    colour = ((1.0 - share) * [139, 106, 72] + share * [58, 158, 92] + rng.normal(0.0, 12.0, (len(cloud), 1))).clip(
+        0, 255
+    )
     return [
-        Submap(map_id="m1", submap_id=k, version=1, graph_version=0, stamp_ns=1, T_map_submap=np.eye(4), points_m=part,
-               view=np.zeros(len(part), np.uint16), origins_m=np.zeros((1, 3), np.float32), colour=np.zeros((0, 3), np.uint8))
-        for k, part in enumerate(np.array_split(cloud, 12))
+        SubmapSketch(map_id="m1", submap_id=k, version=1, stamp_ns=1, T_map_submap=np.eye(4),
+                     points_cm=np.rint(100.0 * cloud[part]).astype(np.int16), colour=colour[part].astype(np.uint8))
+        for k, part in enumerate(np.array_split(np.arange(len(cloud)), -(-len(cloud) // SubmapSketch.MAX_POINTS)))
     ]  # fmt: skip
 
 
@@ -99,7 +103,7 @@ class StubAircraft:
         c.answer(COMMAND_NONCE, NonceRequest, self._on_nonce)
         for name in get_args(CommandName):
             c.answer(COMMAND, Command, self._on_command, leaf=name)
-        c.answer_state(MAP_CLOUD, lambda: list(cloud_of(self.world.trees, 1)))
+        c.answer_state(MAP_SKETCH, lambda: list(cloud_of(self.world.trees, 1)))
         c.every_wall(_TICK_S, self.tick)
         c.every_wall(1.0, self._tell_health)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import socket
+import struct
 import time
 import urllib.error
 import urllib.request
@@ -16,7 +17,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from schemas.health import Health
 from schemas.navigation import MissionState
-from schemas.topics import HEALTH, MISSION_STATE, PREFIX
+from schemas.topics import HEALTH, MAP_SKETCH, MISSION_STATE, PREFIX
 from services.common.bus import Bus
 from services.common.context import HealthBook
 from services.common.session import opened_client
@@ -177,6 +178,30 @@ def test_hostile_words_never_become_markup(ground: Ground, page: Page) -> None:
         assert "onerror" in page.inner_text("#panel-systems")
         assert page.evaluate("document.querySelectorAll('img, script').length") == 2  # the page's own
         assert page.evaluate("document.body.dataset.hacked ?? ''") == ""
+
+
+def test_the_cloud_is_sent_while_a_page_looks_and_only_then(ground: Ground) -> None:
+    ground.aircraft("uav1")
+    client = Client(ground)
+    assert until(lambda: client.aircraft() == ["uav1"])
+    assert client.ask(t="cloud", uav="uav1", on=True)["accepted"]
+    counts: dict[int, int] = {}
+
+    def whole() -> bool:
+        frame = client.socket.recv(timeout=5.0)
+        if isinstance(frame, bytes) and frame[:1] == b"C":
+            number, _, count = struct.unpack_from("<III", frame, 2 + frame[1])
+            counts[number] = count
+        return sum(counts.values()) > 299_000
+
+    assert until(whole, 20.0, 0.0)
+    with opened_client(f"tcp/127.0.0.1:{ground.port}", lambda: False, wait_s=5.0) as session:
+        bus = Bus(session, "uav1", HealthBook())
+        assert until(lambda: bus.listened(MAP_SKETCH))
+        assert client.ask(t="cloud", uav="uav1", on=False)["accepted"]
+        assert until(lambda: not bus.listened(MAP_SKETCH)), "the radio carries what nobody looks at"
+        assert client.ask(t="cloud", uav="uav1", on=True)["accepted"]
+        assert until(lambda: bus.listened(MAP_SKETCH))
 
 
 def test_a_router_alone_is_no_aircraft(ground: Ground) -> None:

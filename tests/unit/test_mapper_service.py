@@ -5,8 +5,9 @@ import pytest
 
 from schemas.camera import Intrinsics
 from schemas.mapping import Submap
+from schemas.sketch import SubmapSketch
 from schemas.slam import Graph, GraphNode, Keyframe
-from schemas.topics import MAP_CLOUD, SLAM_GRAPH, SLAM_KEYFRAME
+from schemas.topics import MAP_CLOUD, MAP_SKETCH, SLAM_GRAPH, SLAM_KEYFRAME
 from services.camera.codecs import encode_depth
 from services.common.config import TreedockConfig
 from services.common.geometry import inverse, level_camera, to_transform
@@ -124,6 +125,22 @@ def test_whole_map_answers_a_late_joiner() -> None:
     late = system.hub.context("detector").ask(MAP_CLOUD, None, Submap, 1.0)
     assert [s.submap_id for s in late] == [1, 2]
     assert sum(len(s.points_m) for s in late) == len(system.mapper.cloud().points_m)
+
+
+def test_the_radio_gets_a_sketch_of_each_submap_while_somebody_looks() -> None:
+    system = _Listener()
+    system.send(_keyframe(1, AHEAD))
+    ground = system.hub.context("station")
+    (late,) = ground.ask(MAP_SKETCH, None, SubmapSketch, 1.0)
+    assert late.submap_id == 1
+    assert late.points_cm[:, 2] == pytest.approx(200, abs=1)
+    seen: list[SubmapSketch] = []
+    ground.on(MAP_SKETCH, seen.append)
+    (moved,) = system.send(_graph(2, {1: level_camera([0.5, 0.0, 1.5], 0.0)}))
+    assert [s.moved for s in seen] == [True]
+    assert seen[0].T_map_submap == pytest.approx(moved.T_map_submap)
+    system.send(_keyframe(1, AHEAD, map_id="m2"))
+    assert [(s.map_id, s.removed) for s in seen[1:]] == [("m1", True), ("m2", False)]
 
 
 def _patch(z: float, n: int = 3000, seed: int = 0) -> KeyframeCloud:

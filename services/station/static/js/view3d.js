@@ -8,17 +8,28 @@ import {
 } from "../vendor/three.js";
 import { palette } from "./map.js";
 
-const TRUNK_M = 3, TRUNKS_MAX = 2000, TRAIL_MAX = 4000, POINTS_MAX = 400000;
-const SLOW_MS = 70, FAST_MS = 40, REST_MS = 350;
+const TRUNK_M = 3, TRUNKS_MAX = 2000, TRAIL_MAX = 4000;
+const SLOW_MS = 60, FAST_MS = 38, REST_MS = 300, POINTS_MIN = 10000;
+const POINTS = 0, REMOVED = 1; // kinds of a cloud's frame; the third, a new place alone, is what is left
+const HEAD_BYTES = 12 + 48; // number, kind, count; the top three rows of the submap's place
+
+/** Whether this browser draws by the processor alone: then smoothed edges would cost more than all points. */
+function drawsInSoftware() {
+  const gl = document.createElement("canvas").getContext("webgl2"), about = gl?.getExtension("WEBGL_debug_renderer_info");
+  const name = gl && about ? String(gl.getParameter(about.UNMASKED_RENDERER_WEBGL)) : "";
+  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+}
 
 export class View3d {
   constructor(box, page) {
     this.box = box;
     this.page = page;
     this.on = false;
-    this.budget = this.smooth = POINTS_MAX - 1;
-    this.renderer = new WebGLRenderer({ antialias: true });
-    this.renderer.setPixelRatio(Math.min(devicePixelRatio || 1, 1.5));
+    this.share = this.smooth = 1; // of the points that is drawn: now, and while it moves
+    const software = drawsInSoftware();
+    this.renderer = new WebGLRenderer({ antialias: !software, powerPreference: "high-performance" });
+    this.renderer.setPixelRatio(Math.min(devicePixelRatio || 1, software ? 1 : 1.5));
     box.append(this.renderer.domElement);
     this.scene = new Scene();
     this.camera = new PerspectiveCamera(55, 1, 0.1, 300);
@@ -62,14 +73,9 @@ export class View3d {
   }
 
   makeCloud() {
-    const geometry = new BufferGeometry();
-    geometry.setAttribute("position", new BufferAttribute(new Float32Array(POINTS_MAX * 3), 3).setUsage(DynamicDrawUsage));
-    geometry.setAttribute("color", new BufferAttribute(new Uint8Array(POINTS_MAX * 3), 3, true).setUsage(DynamicDrawUsage));
-    geometry.setDrawRange(0, 0);
-    this.cloud = new Points(geometry, new PointsMaterial({ size: 2, sizeAttenuation: false, vertexColors: true }));
-    this.cloud.frustumCulled = false;
+    this.cloudMaterial = new PointsMaterial({ size: 2, sizeAttenuation: false, vertexColors: true });
     this.submaps = new Map();
-    this.scene.add(this.cloud);
+    this.points = 0;
   }
 
   theme(colours) {
@@ -114,44 +120,47 @@ export class View3d {
   /** After a reconnect the station knows nothing of our wish. */
   reconnected() {
     this.asked = null;
+    this.clearCloud();
     this.askCloud();
   }
 
   clearCloud() {
-    this.submaps.clear();
-    this.packCloud();
+    for (const number of [...this.submaps.keys()]) this.drop(number);
   }
 
-  /** Take a submap: number, whether it is withdrawn, its count, points (float32), colours (bytes). */
+  drop(number) {
+    const cloud = this.submaps.get(number);
+    if (!cloud) return;
+    this.submaps.delete(number);
+    this.points -= cloud.count;
+    this.scene.remove(cloud);
+    cloud.geometry.dispose();
+  }
+
+  /** Take a submap's frame: points (int16, centimetres in the submap) with colours (bytes), a new place, or its withdrawal. */
   take(uav, data, at) {
     if (!this.craft || uav !== this.craft.uav) return;
-    const head = new DataView(data, at), number = head.getUint32(0, true), removed = head.getUint32(4, true), count = head.getUint32(8, true);
-    const from = at + 12;
-    if (removed || !count) this.submaps.delete(number);
-    else this.submaps.set(number, { points: new Float32Array(data.slice(from, from + count * 12)), colours: new Uint8Array(data, from + count * 12, count * 3) });
-    this.cloudDirty = this.dirty = true;
+    const head = new DataView(data, at), number = head.getUint32(0, true), kind = head.getUint32(4, true), count = head.getUint32(8, true);
+    this.dirty = true;
+    if (kind === REMOVED || kind === POINTS) this.drop(number);
+    if (kind === POINTS) this.add(number, count, data, at + HEAD_BYTES);
+    const cloud = this.submaps.get(number);
+    if (!cloud) return;
+    const m = Array.from({ length: 12 }, (_, k) => head.getFloat32(12 + 4 * k, true));
+    cloud.matrix.set(...m, 0, 0, 0, 1);
+    cloud.matrixWorldNeedsUpdate = true;
   }
 
-  packCloud() {
-    const { position, color } = this.cloud.geometry.attributes;
-    const n = Math.min(POINTS_MAX, [...this.submaps.values()].reduce((sum, s) => sum + s.points.length / 3, 0));
-    const step = stepFor(n); // spread over the whole: the first so many are an even sample, drawn alone while it moves
-    let i = 0;
-    for (const { points, colours } of this.submaps.values()) {
-      for (let k = 0; k < points.length && i < n; k += 3, i++) {
-        const at = ((i * step) % n) * 3;
-        position.array[at] = points[k];
-        position.array[at + 1] = points[k + 1];
-        position.array[at + 2] = points[k + 2];
-        color.array[at] = colours[k];
-        color.array[at + 1] = colours[k + 1];
-        color.array[at + 2] = colours[k + 2];
-      }
-    }
-    position.needsUpdate = color.needsUpdate = true;
-    this.points = n;
-    this.cloudDirty = false;
-    this.dirty = true;
+  add(number, count, data, from) {
+    const steps = new Int16Array(data.slice(from, from + count * 6)), geometry = new BufferGeometry();
+    geometry.setAttribute("position", new BufferAttribute(Float32Array.from(steps, (v) => v / 100), 3));
+    geometry.setAttribute("color", new BufferAttribute(new Uint8Array(data.slice(from + count * 6, from + count * 9)), 3, true));
+    const cloud = new Points(geometry, this.cloudMaterial);
+    cloud.matrixAutoUpdate = false;
+    cloud.count = count;
+    this.points += count;
+    this.submaps.set(number, cloud);
+    this.scene.add(cloud);
   }
 
   changed() {
@@ -224,18 +233,14 @@ export class View3d {
   }
 
   draw(now, moving) {
-    if (this.cloudDirty && now - (this.packedAt ?? 0) > 250) {
-      this.packedAt = now;
-      this.packCloud();
-    }
     if (this.treesDirty) this.placeTrunks();
     if (!moving && !this.dirty) return;
     this.placeCraft();
     this.pace(now);
-    this.cloud.geometry.setDrawRange(0, Math.min(this.points ?? 0, Math.round(this.budget)));
+    // the points of a submap come in such an order that the first so many are an even sample of it
+    for (const cloud of this.submaps.values()) cloud.geometry.setDrawRange(0, Math.ceil(cloud.count * this.share));
     this.renderer.render(this.scene, this.camera);
-    // once it rests, one more frame with every point
-    this.dirty = Boolean(this.cloudDirty) || this.budget < POINTS_MAX;
+    this.dirty = this.share < 1; // once it rests, one more frame with every point
   }
 
   /** Draw as many points as the machine shows smoothly while the view moves, all of them when it rests. */
@@ -247,21 +252,12 @@ export class View3d {
     this.pose.copy(this.camera.matrixWorld);
     if (still) {
       this.stillSince ??= now;
-      if (now - this.stillSince > REST_MS) this.budget = POINTS_MAX;
+      if (now - this.stillSince > REST_MS) this.share = 1;
       return;
     }
     this.stillSince = null;
-    if (this.budget >= POINTS_MAX) this.budget = this.smooth;
-    else if (took > SLOW_MS) this.budget = Math.max(5000, this.budget * 0.6);
-    else if (took < FAST_MS) this.budget = Math.min(POINTS_MAX - 1, this.budget * 1.15);
-    this.smooth = this.budget;
+    const least = Math.min(1, POINTS_MIN / Math.max(1, this.points));
+    if (took < 1000) this.smooth = took > SLOW_MS ? Math.max(least, this.smooth * 0.7) : took < FAST_MS ? Math.min(1, this.smooth * 1.1) : this.smooth;
+    this.share = this.smooth;
   }
-}
-
-/** Return a step that visits all of 0..n-1 (it has no divisor in common with n), near the golden section of n. */
-function stepFor(n) {
-  const common = (a, b) => (b ? common(b, a % b) : a);
-  let step = Math.max(1, Math.round(n * 0.618));
-  while (n > 1 && common(step, n) !== 1) step++;
-  return step;
 }
