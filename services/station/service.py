@@ -45,11 +45,11 @@ from services.navigator.client import send_command
 from services.station.aircraft import Aircraft
 from services.station.brain import Brain, Outgoing
 from services.station.cloud import CloudView
+from services.station.ears import Ears
 from services.station.guard import Guard
 from services.station.keeping import Keeping
 from services.station.launch import open_browser
 from services.station.preview import frame_of
-from services.station.requests import Request
 from services.station.server import WebServer, bound_socket
 from services.station.web import Site
 
@@ -75,10 +75,12 @@ class Station:
         self._buses: dict[str, Bus] = {}
         self._kept: list[object] = []
         self._strangers: set[str] = set()
+        self._waiting: set[tuple[str, str]] = set()
+        """Aircraft and service of tokens that came before anything else of that aircraft."""
         self._reporter = HealthReporter("station", context.health)
         self._pool = ThreadPoolExecutor(_ORDERS_AT_ONCE, thread_name_prefix="order")
         token = self._token()
-        self.site = Site(self.config, Guard(token, local=self.config.local), _Ears(self))
+        self.site = Site(self.config, Guard(token, local=self.config.local), Ears(self.call, lambda: self.brain))
         self.brain = Brain(self.config, self.site, self._send_order, time.time_ns)
         self.brain.on_cloud_wish = self._on_cloud_wish
         self._clouds: dict[str, CloudView] = {}
@@ -143,7 +145,9 @@ class Station:
         uav, service = parts[2], parts[4]
         alive = sample.kind == zenoh.SampleKind.PUT
         if service in _NOT_ABOARD and uav not in self._buses:
-            return  # the ground's own router makes no aircraft
+            # the ground's own router makes no aircraft; it is told of once there is one of that name
+            (self._waiting.add if alive else self._waiting.discard)((uav, service))
+            return
         if self._bus_of(uav) is not None:
             self.brain.aircraft(uav).on_live(service[:64], alive=alive)
 
@@ -165,6 +169,9 @@ class Station:
             bus.subscribe_keys(topic, functools.partial(self._on_message, aircraft, topic, take))
         bus.subscribe(TREES_LIST, functools.partial(self._on_trees, aircraft))
         bus.subscribe(PREVIEW_IMAGE, functools.partial(self._on_preview, aircraft))
+        for early in sorted(pair for pair in self._waiting if pair[0] == uav):
+            self._waiting.discard(early)
+            aircraft.on_live(early[1], alive=True)
         return bus
 
     def _on_message(
@@ -270,29 +277,6 @@ class Station:
         self.keeping.close()
         self._server.stop()
         self._pool.shutdown(wait=False, cancel_futures=True)
-
-
-class _Ears:
-    """Hands what pages say over to the work loop."""
-
-    def __init__(self, station: Station) -> None:
-        self._station = station
-
-    def opened(self, page: int, address: str) -> None:
-        """Hand over."""
-        self._station.call(lambda: self._station.brain.on_open(page, address))
-
-    def closed(self, page: int) -> None:
-        """Hand over."""
-        self._station.call(lambda: self._station.brain.on_close(page, time.monotonic()))
-
-    def said(self, page: int, request: Request) -> None:
-        """Hand over."""
-        self._station.call(lambda: self._station.brain.on_request(page, request, time.monotonic()))
-
-    def misspoke(self, page: int, why: str) -> None:
-        """Hand over."""
-        self._station.call(lambda: self._station.brain.refuse(page, why))
 
 
 def build(context: LiveContext) -> Station:

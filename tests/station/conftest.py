@@ -63,7 +63,7 @@ class Ground:
         flags = [part for setting in settings for part in ("--set", setting)]
         port = ["--port", str(self.port), "--page-port", str(self.page_port)]
         self._start("station", "services.cli.app", "station", *port, *flags)
-        assert until(lambda: self._answers() == answer, 20.0), self.said("station")
+        assert until(lambda: self._answers() == answer, 60.0), self.said("station")
 
     def _answers(self) -> int | None:
         try:

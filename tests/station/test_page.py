@@ -40,7 +40,7 @@ def log(page: Page) -> str:
 
 def test_a_mission_is_started_and_aborted_by_clicks(ground: Ground, page: Page) -> None:
     ground.aircraft("uav1")
-    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=15_000)
+    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=45_000)
     page.click("#order-start")  # a touch in passing starts nothing
     assert "one second" in toast(page)
     page.wait_for_timeout(500)
@@ -60,7 +60,7 @@ def test_a_mission_is_started_and_aborted_by_clicks(ground: Ground, page: Page) 
 
 def test_hold_acts_at_once_and_a_tree_is_chosen(ground: Ground, page: Page) -> None:
     ground.aircraft("uav1")
-    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=15_000)
+    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=45_000)
     held(page, "#order-start")
     true(page, "['select', 'face', 'approach'].includes(window.treedock.craft?.view?.mission?.state)", 40.0)
     page.click("#order-hold")
@@ -86,7 +86,7 @@ WATCH_ALARM = """() => {
 
 def test_link_loss_shows_within_two_seconds_and_so_does_its_return(ground: Ground, page: Page) -> None:
     ground.aircraft("uav1")
-    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=15_000)
+    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=45_000)
     true(page, "document.body.dataset.link === 'good'", 5.0)
     page.evaluate(WATCH_ALARM)
     ground.pause("uav1", stop=True)
@@ -104,22 +104,23 @@ def test_link_loss_shows_within_two_seconds_and_so_does_its_return(ground: Groun
 
 def test_a_lost_station_shows_within_two_seconds_and_comes_back(ground: Ground, page: Page) -> None:
     ground.aircraft("uav1")
-    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=15_000)
+    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=45_000)
     begin_ms = page.evaluate(WATCH_ALARM)
     ground.kill("station")
     page.wait_for_selector("#alarm:not([hidden])", timeout=5_000)
     shown_ms, _ = page.evaluate("window.shown")
     assert shown_ms - begin_ms < 2_100.0
-    assert "STATION OUT OF REACH" in page.inner_text("#alarm")
+    # the link to the aircraft and the station are both silent: for a moment the first may be what is told
+    assert until(lambda: "STATION OUT OF REACH" in page.inner_text("#alarm"), 5.0)
     assert page.get_attribute("#order-start", "aria-disabled") == "true"
     ground.station()
-    page.wait_for_selector("#alarm", state="hidden", timeout=10_000)
-    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=10_000)
+    page.wait_for_selector("#alarm", state="hidden", timeout=30_000)
+    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=30_000)
 
 
 def test_two_operators_one_in_command(ground: Ground, page: Page, browser: Browser) -> None:
     ground.aircraft("uav1", speed=2)
-    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=15_000)
+    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=45_000)
     page.click("#operator")
     page.fill("#name-input", "Anna")
     page.click("#name-dialog .primary")
@@ -152,7 +153,7 @@ def test_several_aircraft_side_by_side(ground: Ground, page: Page) -> None:
     assert page.locator(".tile").count() == 2
     page.click(".tile >> nth=1")
     assert page.inner_text("#who-uav") == "uav2"
-    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=15_000)
+    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=45_000)
     held(page, "#order-start")
     true(page, "window.treedock.craft?.view?.mission?.state !== 'idle'", 5.0)
     assert page.evaluate("window.treedock.crafts.get('uav1').view.mission.state") == "idle"
@@ -160,7 +161,7 @@ def test_several_aircraft_side_by_side(ground: Ground, page: Page) -> None:
 
 def test_the_keyboard_alone_is_enough(ground: Ground, page: Page) -> None:
     ground.aircraft("uav1")
-    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=15_000)
+    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=45_000)
     page.focus("#order-start")
     page.keyboard.down("Enter")
     page.wait_for_timeout(1_300)
@@ -173,19 +174,23 @@ def test_the_keyboard_alone_is_enough(ground: Ground, page: Page) -> None:
 
 def test_every_target_is_large_enough_for_a_finger(ground: Ground, page: Page) -> None:
     ground.aircraft("uav1")
-    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=15_000)
+    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=45_000)
     for width, height in ((1024, 768), (390, 844)):
         page.set_viewport_size({"width": width, "height": height})
         page.wait_for_timeout(300)
         small = page.evaluate("""[...document.querySelectorAll('button')].filter(b => b.offsetParent)
             .map(b => [b.id || b.className, b.offsetWidth, b.offsetHeight]).filter(b => b[1] < 44 || b[2] < 44)""")
         assert small == []
+        covered = page.evaluate("""[...document.querySelectorAll('button')].filter(b => b.offsetParent && b.closest('.stage'))
+            .map(b => [b.id, b.getBoundingClientRect()]).filter(([id, r]) => id !== 'preview' && !document.elementFromPoint(
+                r.left + r.width / 2, r.top + r.height / 2)?.closest('#' + id)).map(b => b[0])""")
+        assert covered == []
         assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
 
 
 def test_a_second_hello_tells_everything_again(ground: Ground, page: Page) -> None:
     ground.aircraft("uav1")
-    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=15_000)
+    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=45_000)
     held(page, "#order-start")
     true(page, "window.treedock.craft.trees.length > 3", 30.0)
     before = page.evaluate("window.treedock.craft.trees.length")

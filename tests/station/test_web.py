@@ -211,6 +211,13 @@ def test_a_router_alone_is_no_aircraft(ground: Ground) -> None:
     ground.aircraft("uav1")
     assert until(lambda: client.aircraft() == ["uav1"])
 
+    def router() -> list[bool]:
+        client.hear("state")
+        (view,) = client.state["aircraft"]
+        return [alive for name, _, _, _, alive, _ in view["services"] if name == "router"]
+
+    assert until(lambda: router() == [True]), "it was there before the aircraft: that is not 'gone'"
+
 
 def test_strangers_keys_and_names_do_no_harm(ground: Ground) -> None:
     """Garbage on every key, tokens of a hundred aircraft, names that are no names."""

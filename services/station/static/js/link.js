@@ -38,6 +38,11 @@ export class Link {
     return performance.now() - this.heardAt < SILENT_MS;
   }
 
+  /** Whether it ever was: before that there is nothing to call old. */
+  get everUp() {
+    return Number.isFinite(this.heardAt);
+  }
+
   open() {
     const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/ws`);
     socket.binaryType = "arraybuffer";

@@ -1,16 +1,17 @@
 // The page: joins link, model, map, panels and orders. Redraws the map when something moved, the words four times a second.
 
-import { $, duration, el, keyed, set, text, words } from "./dom.js";
+import { drawAlarm, drawMission, drawPreview } from "./cards.js";
+import { $, el, set, text } from "./dom.js";
+import { drawFleet, drawTiles } from "./fleet.js";
 import { onHold } from "./hold.js";
 import { Link } from "./link.js";
-import { MapView, palette } from "./map.js";
+import { MapView } from "./map.js";
 import { Craft } from "./model.js";
 import { CHOOSE, OrderBar } from "./orders.js";
+import { palette } from "./paint.js";
 import { drawLog, drawSystems, drawTrees, drawVitals } from "./panels.js";
 
 const WORDS_MS = 250;
-const TONES = { docked: "good", landed: "good", failed: "bad", released: "bad", hold: "warn", idle: "calm" };
-const TITLES = { idle: "Ready on the ground", preflight: "Checking before flight", take_off: "Taking off", scan: "Turning to scan", select: "Choosing a tree", face: "Turning to the tree", approach: "Approaching", dock: "Docking", docked: "Docked", undock: "Backing off", return: "Flying back", landing: "Landing", landed: "Landed", hold: "Holding", released: "Released to the pilot", failed: "Failed" };
 
 class Page {
   constructor() {
@@ -64,7 +65,7 @@ class Page {
     this.cloud = message.cloud;
     this.inventory = message.inventory;
     this.view3d?.reconnected();
-    text($("operator"), this.me.name);
+    text($("operator-name"), this.me.name);
     this.events = [];
     this.crafts.forEach((craft) => (craft.treesVersion = -1));
   }
@@ -109,8 +110,9 @@ class Page {
   // -- what the operator does
 
   buttons() {
-    $("zoom-in").onclick = () => this.map.zoom(1.35);
-    $("zoom-out").onclick = () => this.map.zoom(1 / 1.35);
+    $("zoom-in").onclick = () => (this.view3d?.on ? this.view3d.zoom(1.35) : this.map.zoom(1.35));
+    $("zoom-out").onclick = () => (this.view3d?.on ? this.view3d.zoom(1 / 1.35) : this.map.zoom(1 / 1.35));
+    $("preview").onclick = () => this.enlarge(!$("preview").hasAttribute("data-big"));
     $("fit").onclick = () => (this.view3d?.on ? this.view3d.fit() : this.map.fit());
     $("follow").onclick = () => {
       this.map.follow = !this.map.follow;
@@ -129,9 +131,9 @@ class Page {
     $("name-dialog").addEventListener("close", () => {
       const name = $("name-input").value.trim();
       if (name) this.link.name = name;
-      text($("operator"), this.link.name);
+      text($("operator-name"), this.link.name);
     });
-    text($("operator"), this.link.name);
+    text($("operator-name"), this.link.name);
     const tabs = ["trees", "log", "systems"];
     for (const name of tabs) {
       $(`tab-${name}`).onclick = () => this.tab(name);
@@ -143,6 +145,12 @@ class Page {
     addEventListener("keydown", (e) => {
       if (e.key.toLowerCase() === "h" && !e.repeat && !e.ctrlKey && !e.metaKey && !e.altKey && !(e.target instanceof HTMLInputElement)) this.orders.holdNow();
     });
+  }
+
+  /** The camera's picture large over the map, or small in its corner. */
+  enlarge(big) {
+    set($("preview"), "data-big", big ? "" : null);
+    set($("preview"), "aria-expanded", big);
   }
 
   /** Who else is there; to each of them command of this aircraft can be handed. */
@@ -264,106 +272,21 @@ class Page {
 
   drawWords() {
     const now = performance.now(), craft = this.craft;
-    this.map.inset = this.phone.matches ? { top: 0, bottom: 0, right: 60 } : { top: Math.min(112, innerHeight * 0.15), bottom: 44, right: 0 };
-    this.drawFleet(now);
-    if (this.grid) this.drawTiles(now);
-    this.drawMission(craft, now);
-    this.drawAlarm(craft, now);
+    this.map.inset = this.phone.matches ? { top: 0, bottom: 0, right: 60 } : { top: Math.min($("mission").offsetHeight + 8, innerHeight * 0.25), bottom: 44, right: 0 };
+    drawFleet(this, now);
+    if (this.grid) drawTiles(this, now);
+    drawMission(craft, now, this.grid);
+    drawAlarm(this, craft, now);
     drawVitals(craft, now);
     if (!$("panel-trees").hidden) drawTrees(craft, this);
     if (!$("panel-log").hidden) drawLog(this.events, this.grid ? null : craft?.uav, this.crafts.size > 1);
     drawSystems(craft, now);
-    this.drawPreview(craft, now);
+    drawPreview(this, craft, now);
     this.orders.draw();
     this.map.dirty ||= craft ? craft.link(now) !== this.linkWas : false;
     this.linkWas = craft?.link(now);
   }
 
-  drawFleet(now) {
-    const items = [...this.crafts.values()].map((craft) => ({ key: craft.uav, craft }));
-    if (items.length > 1) items.unshift({ key: "*", craft: null });
-    keyed($("fleet"), items, (i) => i.key, (i) => {
-      const node = el("button", { class: "chip" }, el("i", { class: "dot" }), el("div", {}, el("b"), el("small")));
-      node.onclick = () => this.choose(i.craft ? i.craft.uav : null);
-      return node;
-    }, (node, { craft }) => {
-      const [dot, box] = node.children, link = craft?.link(now) ?? "none";
-      set(dot, "data-level", link);
-      set(dot, "hidden", craft ? null : "");
-      text(box.firstChild, craft ? craft.uav : "All");
-      text(box.lastChild, craft ? (link === "lost" ? "link lost" : words(craft.view?.mission?.state ?? "no mission")) : `${this.crafts.size} aircraft`);
-      set(node, "aria-pressed", craft ? !this.grid && craft === this.craft : this.grid);
-    });
-    const up = this.link.up;
-    text($("station-link"), up ? "station" : "station lost");
-    set($("station-link"), "data-level", up ? "good" : "lost");
-  }
-
-  drawTiles(now) {
-    keyed($("grid"), [...this.crafts.values()], (c) => c.uav, (c) => {
-      const canvas = el("canvas"), node = el("button", { class: "tile" }, el("header", {}, el("i", { class: "dot" }), el("b"), el("span"), el("small")), canvas);
-      const map = new MapView(canvas, { bare: true });
-      map.show(c);
-      this.tiles.set(c.uav, { node, map });
-      node.onclick = () => this.choose(c.uav);
-      return node;
-    }, (node, c) => {
-      const [dot, name, right, reason] = node.firstChild.children, link = c.link(now), v = c.view;
-      set(dot, "data-level", link);
-      set(node, "data-level", link);
-      set(node, "aria-current", c === this.craft ? "true" : null);
-      text(name, c.uav);
-      text(right, v?.vehicle?.battery == null ? "" : `${Math.round(v.vehicle.battery * 100)} %`);
-      text(reason, link === "lost" ? `link lost, ${duration(c.linkAge(now))}` : v?.mission ? `${TITLES[v.mission.state] ?? words(v.mission.state)}: ${v.mission.reason}` : "no mission is heard");
-      this.tiles.get(c.uav).map.dirty = true;
-    });
-    for (const uav of this.tiles.keys()) if (!this.crafts.has(uav)) this.tiles.delete(uav);
-  }
-
-  drawMission(craft, now) {
-    const mission = craft?.view?.mission;
-    $("mission").hidden = this.grid;
-    if (!mission) {
-      text($("mission-state"), craft ? "No mission is heard" : "No aircraft yet");
-      text($("mission-for"), "");
-      text($("mission-reason"), craft ? "Is the navigator running?" : "Waiting for an aircraft to be heard.");
-      $("mission-target").hidden = true;
-      set($("mission"), "data-tone", "calm");
-      return;
-    }
-    const age = craft.age(mission.age, now), late = age > 1.25;
-    text($("mission-state"), TITLES[mission.state] ?? words(mission.state));
-    text($("mission-for"), late ? `told ${duration(age)} ago` : duration(mission.for + age));
-    set($("mission-for"), "class", late ? "mission-for late" : "mission-for");
-    const same = mission.reason.toLowerCase() === mission.state;
-    text($("mission-reason"), (mission.failsafe ? `Failsafe ${words(mission.failsafe)}: ` : "") + (same ? "" : mission.reason));
-    const tree = mission.target;
-    $("mission-target").hidden = tree === null;
-    if (tree !== null) text($("mission-target"), `Tree ${tree}${mission.distance === null ? "" : ` · ${mission.distance.toFixed(2)} m`}${mission.heading_error === null ? "" : ` · ${Math.abs((mission.heading_error * 180) / Math.PI).toFixed(0)}° ${mission.heading_error >= 0 ? "left" : "right"}`}`);
-    set($("mission"), "data-tone", late ? "warn" : mission.failsafe ? "warn" : TONES[mission.state] ?? "fly");
-  }
-
-  drawAlarm(craft, now) {
-    const alarm = $("alarm"), others = [...this.crafts.values()].filter((c) => c !== craft && c.link(now) === "lost");
-    let said = "";
-    if (!this.link.up) said = "STATION OUT OF REACH: what you see is old, no order will arrive";
-    else if (craft?.link(now) === "lost") said = `LINK TO ${craft.uav} LOST for ${duration(craft.linkAge(now))}: what you see is old`;
-    else if (craft?.view?.vehicle?.override) said = "THE PILOT HAS THE AIRCRAFT: the mission is silent";
-    else if (others.length) said = `LINK LOST to ${others.map((c) => c.uav).join(", ")}`;
-    text(alarm, said);
-    alarm.hidden = !said;
-    set(document.body, "data-old", said && (!this.link.up || craft?.link(now) === "lost") ? "true" : null);
-    set(document.body, "data-link", craft ? craft.link(now) : "none");
-  }
-
-  drawPreview(craft, now) {
-    const age = craft ? (now - craft.previewAt) / 1000 : Infinity, none = !Number.isFinite(age) || age > 60;
-    $("preview").hidden = this.grid;
-    set($("preview"), "data-empty", none ? "true" : null);
-    $("preview-image").hidden = none || !$("preview-image").src;
-    text($("preview-word"), none ? "no preview" : age > 1.5 ? `${duration(age)} old` : "live");
-    set($("preview-word"), "class", age > 1.5 && !none ? "late" : null);
-  }
 }
 
 window.treedock = new Page();

@@ -1,18 +1,10 @@
 // The map from above: x up the screen (the first camera heading), y to the left, metres.
 
+import { listen } from "./hands.js";
 import { CONE_M, CONE_RAD } from "./model.js";
+import { circle, label, line, palette } from "./paint.js";
 
 const MIN_SCALE = 6, MAX_SCALE = 400; // pixels per metre
-
-/** The colours of the present theme. */
-export function palette() {
-  const style = getComputedStyle(document.documentElement);
-  const of = (name) => style.getPropertyValue(`--${name}`).trim();
-  return {
-    map: of("map"), grid: of("map-grid"), grid5: of("map-grid-5"), ink: of("map-ink"), seen: of("seen"), cone: of("cone"), coneLine: of("cone-line"), craft: of("craft"),
-    trail: of("trail"), tree: of("tree"), treeInk: of("tree-ink"), un: of("tree-un"), visited: of("tree-visited"), target: of("tree-target"), soft: of("soft"), surface: of("surface"),
-  };
-}
 
 export class MapView {
   constructor(canvas, { onPick = null, bare = false } = {}) {
@@ -28,7 +20,7 @@ export class MapView {
     this.inset = { top: 0, bottom: 0, right: 0 }; // covered by what lies over the map
     this.colours = palette();
     this.dirty = true;
-    if (!bare) this.listen();
+    if (!bare) listen(this);
     new ResizeObserver(() => this.resize()).observe(canvas);
   }
 
@@ -57,56 +49,7 @@ export class MapView {
     return { x: this.centre.x - (v - this.height / 2) / this.scale, y: this.centre.y - (u - this.width / 2) / this.scale };
   }
 
-  // -- hands and keys
-
-  listen() {
-    const pointers = new Map();
-    let moved = 0, spread = 0;
-    const c = this.canvas;
-    const local = (e) => ({ u: e.clientX - c.getBoundingClientRect().left, v: e.clientY - c.getBoundingClientRect().top });
-    c.addEventListener("pointerdown", (e) => {
-      c.setPointerCapture(e.pointerId);
-      pointers.set(e.pointerId, local(e));
-      moved = pointers.size > 1 ? 99 : 0;
-      spread = 0;
-    });
-    c.addEventListener("pointermove", (e) => {
-      const from = pointers.get(e.pointerId);
-      if (!from) return;
-      const to = local(e);
-      pointers.set(e.pointerId, to);
-      moved += Math.abs(to.u - from.u) + Math.abs(to.v - from.v);
-      if (moved < 6) return;
-      const share = 1 / pointers.size;
-      this.move((to.u - from.u) * share, (to.v - from.v) * share);
-      if (pointers.size === 2) {
-        const [a, b] = [...pointers.values()], now = Math.hypot(a.u - b.u, a.v - b.v);
-        if (spread) this.zoom(now / spread, (a.u + b.u) / 2, (a.v + b.v) / 2);
-        spread = now;
-      }
-    });
-    const up = (e) => {
-      if (!pointers.delete(e.pointerId)) return;
-      spread = 0;
-      if (e.type === "pointerup" && moved < 6) this.pick(local(e));
-    };
-    c.addEventListener("pointerup", up);
-    c.addEventListener("pointercancel", up);
-    c.addEventListener("wheel", (e) => {
-      e.preventDefault();
-      const { u, v } = local(e);
-      this.zoom(Math.exp(-e.deltaY * 0.0015), u, v);
-    }, { passive: false });
-    c.addEventListener("keydown", (e) => {
-      const step = { ArrowUp: [0, 60], ArrowDown: [0, -60], ArrowLeft: [60, 0], ArrowRight: [-60, 0] }[e.key];
-      if (step) this.move(...step);
-      else if (e.key === "+" || e.key === "=") this.zoom(1.3);
-      else if (e.key === "-") this.zoom(1 / 1.3);
-      else if (e.key === "f" || e.key === "F") this.fit();
-      else return;
-      e.preventDefault();
-    });
-  }
+  // -- what hands do
 
   move(du, dv) {
     this.centre.x += dv / this.scale;
@@ -147,17 +90,15 @@ export class MapView {
   applyFit() {
     const craft = this.craft;
     if (!craft || !this.width) return;
-    const points = craft.trees.filter((t) => Math.hypot(t.x, t.y) < 60).map((t) => [t.x, t.y]);
-    const at = craft.shown;
+    const points = craft.trees.filter((t) => Math.hypot(t.x, t.y) < 60).map((t) => [t.x, t.y]), at = craft.shown;
     points.push([0, 0]);
-    if (at) points.push([at.x, at.y]);
+    if (at) points.push([at.x, at.y], ...[-0.5, 0, 0.5].map((k) => coneEnd(at, k)));
     const xs = points.map((p) => p[0]), ys = points.map((p) => p[1]);
     const box = { x0: Math.min(...xs), x1: Math.max(...xs), y0: Math.min(...ys), y1: Math.max(...ys) };
-    const margin = this.bare ? 12 : 34;
-    const { top, bottom } = this.inset;
-    const scale = Math.min((this.width - 2 * margin) / Math.max(8, box.y1 - box.y0), (this.height - 2 * margin - top - bottom) / Math.max(8, box.x1 - box.x0));
+    const { top, bottom, right } = this.inset, margin = Math.min(34, 0.06 * Math.min(this.width, this.height) + 4);
+    const scale = Math.min((this.width - 2 * margin - right) / Math.max(8, box.y1 - box.y0), (this.height - 2 * margin - top - bottom) / Math.max(8, box.x1 - box.x0));
     this.scale = Math.min(MAX_SCALE, Math.max(MIN_SCALE * 0.5, scale));
-    this.centre = { x: (box.x0 + box.x1) / 2 + (top - bottom) / 2 / this.scale, y: (box.y0 + box.y1) / 2 };
+    this.centre = { x: (box.x0 + box.x1) / 2 + (top - bottom) / 2 / this.scale, y: (box.y0 + box.y1) / 2 - right / 2 / this.scale };
   }
 
   // -- drawing
@@ -197,23 +138,16 @@ export class MapView {
     const a = this.at(0, this.height), b = this.at(this.width, 0);
     const step = this.scale < 12 ? 5 : 1;
     c.lineWidth = 1;
-    for (let x = Math.ceil(a.x / step) * step; x <= b.x; x += step) this.gridLine(c, this.px(x, a.y), this.px(x, b.y), x % 5 === 0);
-    for (let y = Math.ceil(b.y / step) * step; y <= a.y; y += step) this.gridLine(c, this.px(a.x, y), this.px(b.x, y), y % 5 === 0);
+    for (let x = Math.ceil(a.x / step) * step; x <= b.x; x += step) line(c, this.px(x, a.y), this.px(x, b.y), x % 5 === 0 ? this.colours.grid5 : this.colours.grid);
+    for (let y = Math.ceil(b.y / step) * step; y <= a.y; y += step) line(c, this.px(a.x, y), this.px(b.x, y), y % 5 === 0 ? this.colours.grid5 : this.colours.grid);
     const [u, v] = this.px(0, 0);
     c.strokeStyle = this.colours.soft;
     c.lineWidth = 2;
     c.beginPath();
     c.moveTo(u - 9, v); c.lineTo(u + 9, v); c.moveTo(u, v - 9); c.lineTo(u, v + 9);
     c.stroke();
-    if (!this.bare) this.label(c, "start", u + 8, v + 16, this.colours.soft, 13);
-  }
-
-  gridLine(c, [u0, v0], [u1, v1], bold) {
-    c.strokeStyle = bold ? this.colours.grid5 : this.colours.grid;
-    c.beginPath();
-    c.moveTo(Math.round(u0) + 0.5, Math.round(v0) + 0.5);
-    c.lineTo(Math.round(u1) + 0.5, Math.round(v1) + 0.5);
-    c.stroke();
+    const at = this.craft?.shown, near = at && Math.hypot(at.x, at.y) * this.scale < 60;
+    if (!this.bare && !near) label(c, "start", u + 8, v + 16, this.colours.soft, 13, this.colours.map);
   }
 
   drawTrail(c, craft) {
@@ -302,7 +236,7 @@ export class MapView {
       c.stroke();
     }
     if (!this.bare && (this.scale > 14 || kind !== "unsuitable")) {
-      this.label(c, String(tree.id), u + r + 5, v + r + 14, kind === "unsuitable" ? k.soft : k.ink, 15);
+      label(c, String(tree.id), u + r + 5, v + r + 14, kind === "unsuitable" ? k.soft : k.ink, 15, this.colours.map);
     }
   }
 
@@ -343,32 +277,32 @@ export class MapView {
     c.stroke();
     c.restore();
     c.setLineDash([]);
-    if (!this.bare) this.label(c, craft.uav, u + r + 4, v - r, this.colours.craft, 15);
+    if (!this.bare) this.nameCraft(c, craft.uav, u, v, r, at.yaw);
+  }
+
+  /** The name stands behind the aircraft, where it flies away from: what it flies to stays readable. */
+  nameCraft(c, name, u, v, r, yaw) {
+    const words = name.length > 18 ? `${name.slice(0, 17)}…` : name;
+    c.font = `650 15px system-ui, "DejaVu Sans", sans-serif`;
+    const w = c.measureText(words).width, side = Math.sin(yaw), up = -Math.cos(yaw);
+    const x = u + side * (r + 10) - w / 2 + (side * w) / 2, y = v - up * (r + 16) + 5;
+    label(c, words, Math.min(Math.max(4, x), this.width - w - 4), y, this.colours.craft, 15, this.colours.map);
   }
 
   drawScale(c) {
     const metres = [0.5, 1, 2, 5, 10, 20, 50].find((m) => m * this.scale > 70) ?? 50, w = metres * this.scale;
-    const u = this.width - w - 18 - this.inset.right, v = this.height - 18 - this.inset.bottom;
+    // at the bottom right above the legend; on a phone, where tools and picture lie there, at the top
+    const small = this.inset.right > 0, u = small ? 12 : this.width - w - 18, v = small ? 28 : this.height - 18 - this.inset.bottom;
     c.strokeStyle = c.fillStyle = this.colours.ink;
     c.lineWidth = 3;
     c.beginPath();
     c.moveTo(u, v - 6); c.lineTo(u, v); c.lineTo(u + w, v); c.lineTo(u + w, v - 6);
     c.stroke();
-    this.label(c, `${metres} m`, u + w / 2 - 14, v - 8, this.colours.ink, 14);
-  }
-
-  label(c, words, u, v, colour, size) {
-    c.font = `650 ${size}px system-ui, "DejaVu Sans", sans-serif`;
-    c.lineWidth = 4;
-    c.lineJoin = "round";
-    c.strokeStyle = this.colours.map;
-    c.strokeText(words, u, v);
-    c.fillStyle = colour;
-    c.fillText(words, u, v);
+    label(c, `${metres} m`, u + w / 2 - 14, v - 8, this.colours.ink, 14, this.colours.map);
   }
 }
 
-function circle(c, u, v, r) {
-  c.beginPath();
-  c.arc(u, v, r, 0, 2 * Math.PI);
+/** Return where a ray of the view cone ends, `k` of its width off the middle. */
+function coneEnd(at, k) {
+  return [at.x + CONE_M * Math.cos(at.yaw + k * CONE_RAD), at.y + CONE_M * Math.sin(at.yaw + k * CONE_RAD)];
 }

@@ -12,7 +12,7 @@ const OLD_S = 3;
 const ORDERS = [
   { name: "start", label: "START", hint: "hold 1 s", kind: "go", ms: HOLD_MS, not: (s) => (GROUNDED.includes(s) ? "" : `a mission is under way: ${s}`) },
   { name: "hold", label: "HOLD", hint: "at once", kind: "pause", ms: 0, not: (s) => (GROUNDED.includes(s) ? "nothing flies" : "") },
-  { name: "resume", label: "RESUME", hint: "hold 1 s", kind: "", ms: HOLD_MS, not: (s) => (s === "hold" ? "" : "nothing to resume") },
+  { name: "resume", label: "RESUME", hint: "hold 1 s", kind: "go", ms: HOLD_MS, not: (s) => (s === "hold" ? "" : "nothing to resume") },
   { name: "next", label: "NEXT TREE", hint: "hold 1 s", kind: "", ms: HOLD_MS, not: (s) => (["face", "approach", "dock", "docked"].includes(s) ? "" : "no target to leave") },
   { name: "land", label: "LAND", hint: "hold 1 s", kind: "land", ms: HOLD_MS, not: (s) => (GROUNDED.includes(s) ? "it is on the ground" : s === "landing" ? "it is landing" : "") },
   { name: "abort", label: "ABORT", hint: "hold 1 s", kind: "stop", ms: HOLD_MS, not: (s) => (GROUNDED.includes(s) ? "no mission is under way" : "") },

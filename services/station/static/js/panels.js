@@ -30,12 +30,19 @@ export function drawVitals(craft, now) {
     const level = v.topic === null ? "" : levelOf(craft, v.topic, now);
     const age = craft?.view?.topics.find((t) => t[0] === v.topic)?.[1];
     const old = level === "late" || level === "lost";
-    const [span, small] = node.lastElementChild.children;
+    const [span, small] = node.querySelector("dd").children;
     text(span, value ? value[0] : "—");
     text(small, old ? `${duration(craft.age(age, now))} old` : value?.[2] ?? "");
     set(node, "data-level", level || null);
     set(node, "data-tone", old ? null : value?.[1] || null);
+    if (v.id === "battery") drawGauge(node, craft?.view?.vehicle?.battery ?? null);
   });
+}
+
+function drawGauge(node, share) {
+  const gauge = node.querySelector("meter") ?? node.appendChild(el("meter", { min: 0, max: 1, low: 0.35, high: 0.36, optimum: 1, "aria-hidden": "true" }));
+  gauge.hidden = share === null;
+  gauge.value = share ?? 0;
 }
 
 // -- trees
@@ -44,7 +51,7 @@ const KIND_WORDS = { target: "target", visited: "visited", suitable: "suitable",
 
 export function drawTrees(craft, page) {
   const panel = $("panel-trees"), trees = craft?.trees ?? [];
-  text($("tree-count"), trees.length ? `${trees.filter((t) => t.suitable).length} of ${trees.length}` : "");
+  text($("tree-count"), trees.length || "");
   if (!trees.length) {
     panel.replaceChildren(el("p", { class: "empty", "data-key": "empty" }, craft ? "No trees yet. They appear here as the scan finds them." : "No aircraft."));
     return;

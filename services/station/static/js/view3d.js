@@ -6,7 +6,7 @@ import {
   Line, LineBasicMaterial, Matrix4, Mesh, MeshLambertMaterial, OrbitControls, PerspectiveCamera, Points, PointsMaterial, Raycaster, Scene, TorusGeometry, Vector2,
   Vector3, WebGLRenderer,
 } from "../vendor/three.js";
-import { palette } from "./map.js";
+import { palette } from "./paint.js";
 
 const TRUNK_M = 3, TRUNKS_MAX = 2000, TRAIL_MAX = 4000;
 const SLOW_MS = 60, FAST_MS = 38, REST_MS = 300, POINTS_MIN = 10000;
@@ -175,7 +175,7 @@ export class View3d {
       m.makeScale(tree.radius, tree.radius, TRUNK_M).setPosition(tree.x, tree.y, tree.z);
       this.trunks.setMatrixAt(i, m);
       this.trunks.setColorAt(i, colour.set(tree.id === this.page.selected ? k.ink : { suitable: k.tree, unsuitable: k.un, visited: k.visited, target: k.target }[kind]));
-      if (kind === "target" || tree.id === this.page.selected) {
+      if (kind === "target") {
         this.ring.visible = true;
         this.ring.position.set(tree.x, tree.y, tree.z + 0.05);
         this.ring.scale.setScalar(tree.radius + 2 * tree.sigma + 0.12);
@@ -215,6 +215,12 @@ export class View3d {
     const reach = Math.max(5, ...trees.map((t) => Math.hypot(t.x, t.y)));
     this.controls.target.set(0, 0, 0.8);
     this.camera.position.set(-reach * 1.5, 0, reach * 0.95);
+    this.controls.update();
+    this.dirty = true;
+  }
+
+  zoom(by) {
+    this.camera.position.sub(this.controls.target).divideScalar(by).add(this.controls.target);
     this.controls.update();
     this.dirty = true;
   }
