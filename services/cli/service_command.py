@@ -57,6 +57,10 @@ def run_by_name(
         InputError: a configuration or an input that the service cannot use.
     """
     from services.common.errors import InputError
+    from services.common.process import BACKGROUND, give_way
+
+    if name in BACKGROUND:
+        give_way(BACKGROUND[name])  # before any other thread is made: they inherit it
     from services.common.runtime import run_service
     from services.common.stop import end_process
 

@@ -8,9 +8,12 @@ import gc
 import os
 import signal
 import threading
+from collections.abc import Mapping
 from pathlib import Path
 
 _PR_SET_PDEATHSIG = 1
+BACKGROUND: Mapping[str, int] = {"mapper": 5, "detector": 5, "recorder": 5, "preview": 10}
+"""Niceness of services that may be late: nobody flies by them within a frame. Under systemd CPUWeight does the same."""
 _STARTING_OBJECTS = 50_000
 """New objects between two looks of the garbage collector while libraries load: the usual 700 cost a fifth of the start."""
 _USUAL = gc.get_threshold()
