@@ -9,23 +9,19 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from schemas.camera import RgbdFrame
-from schemas.topics import PREVIEW_IMAGE
 from services.evaluate.bench import BenchOptions, BenchReport
 from services.evaluate.frame_ways import Way, compare, table_of
-from services.evaluate.live_set import READY_WITHIN_S, frames_for, live_config, send, told
-from services.evaluate.passages import HEAD, Passages, figures_of, line_of, stage_lines
+from services.evaluate.live_set import READY_WITHIN_S, Flight, fly, frames_for, live_config, observed, told
+from services.evaluate.passages import HEAD, figures_of, line_of, stage_lines
 from services.evaluate.processes import Processes
-from services.evaluate.usage import Budget, Meter, Usage, over_budget
+from services.evaluate.usage import Budget, over_budget
 
 if TYPE_CHECKING:
-    from services.common.bus import Bus
+    pass
 
 RATE_HZ = 30.0
 ONBOARD = ("camera", "slam", "mapper", "detector", "refiner", "navigator", "autopilot", "preview", "recorder")
@@ -42,24 +38,7 @@ BUDGETS: Mapping[str, Budget] = {
     "preview": Budget(0.10, 110.0),
     "recorder": Budget(0.30, 160.0),
 }
-_SETTLE_S = 2.0
-_DRAIN_S = 2.0
 _AIMS = {"latency_ms_p99": 80.0, "cpu_cores": 1.8, "memory_mb": 1600.0, "ready_s": 6.0, "ready_alone_s_max": 3.0}
-
-
-@dataclass(frozen=True)
-class Flight:
-    """What a run of the whole set gave."""
-
-    seen: Passages
-    used: Mapping[str, Usage]
-    ready_s: float
-    """From the first service's start until all were ready; the router ran already."""
-
-    @property
-    def dropped(self) -> int:
-        """Frames handed to the camera that no target answered."""
-        return self.seen.sent - sum(p.target_ns > 0 for p in self.seen.by_stamp.values())
 
 
 def run(options: BenchOptions) -> BenchReport:
@@ -67,7 +46,7 @@ def run(options: BenchOptions) -> BenchReport:
     name, frames = frames_for(options)
     ways = compare(frames[0], quick=options.quick)
     options.tell("frames by shared memory and TCP: measured")
-    flight = fly(frames, RATE_HZ)
+    flight = fly(frames, RATE_HZ, ONBOARD, autopilot=True)
     options.tell(f"whole set: {figures_of(flight.seen)}")
     alone = {} if options.quick else ready_alone()
     figures = _figures(flight, alone, ways)
@@ -78,36 +57,11 @@ def run(options: BenchOptions) -> BenchReport:
         "memory": "PSS: what processes share is counted once",
         "dropped": "frames handed to the camera service that trees/target did not answer",
     }
+    conditions["beside them"] = ", ".join(
+        f"{name} {usage.cpu_cores:.2f} cores" for name, usage in flight.used.items() if name not in flight.aboard
+    )
     parts = (_summary(figures), _flown(flight), _processes(flight), table_of(ways), _ready(flight, alone))
     return BenchReport(figures, conditions, "\n\n".join(part for part in parts if part))
-
-
-def fly(frames: Sequence[RgbdFrame], rate_hz: float) -> Flight:
-    """Run the whole onboard set over raw frames, and watch it.
-
-    Raises:
-        InputError: a service ended, or was not ready in time.
-    """
-    with tempfile.TemporaryDirectory(prefix="treedock-system-") as folder:
-        config = live_config(Path(folder))
-        with (
-            Processes(config, Path(folder)) as running,
-            _observed(running, config.router.endpoint, config.uav) as (bus, seen),
-        ):
-            begin_s = time.monotonic()
-            for name in ONBOARD:
-                running.start(name)
-            running.wait(lambda: all(bus.alive(name) for name in ONBOARD), READY_WITHIN_S, "services to be ready")
-            ready_s = time.monotonic() - begin_s
-            running.spawn("px4", "services.simulator.px4", config.autopilot.connection.rsplit(":", 1)[1])
-            running.wait(lambda: seen.connected, 60.0, "the autopilot to hear its stand-in")
-            time.sleep(_SETTLE_S)
-            meter = Meter({name: running.pid(name) for name in ("router", *ONBOARD)})
-            send(bus, frames, rate_hz, running)
-            used = meter.read()
-            time.sleep(_DRAIN_S)
-            seen.sent = len(frames)
-    return Flight(seen, used, ready_s)
 
 
 def ready_alone() -> dict[str, float]:
@@ -117,7 +71,7 @@ def ready_alone() -> dict[str, float]:
         config = live_config(Path(folder))
         with (
             Processes(config, Path(folder)) as running,
-            _observed(running, config.router.endpoint, config.uav) as (bus, _),
+            observed(running, config.router.endpoint, config.uav) as (bus, _),
         ):
             for name in ONBOARD:
                 begin_s = time.monotonic()
@@ -128,28 +82,12 @@ def ready_alone() -> dict[str, float]:
     return found
 
 
-@contextmanager
-def _observed(running: Processes, endpoint: str, uav: str) -> Iterator[tuple[Bus, Passages]]:
-    """Start the router, and open the session of the sensor, which also observes and looks at the preview."""
-    from services.common.bus import Bus
-    from services.common.context import HealthBook
-    from services.common.session import opened_client
-
-    running.start("router")
-    with opened_client(endpoint, lambda: False, wait_s=60.0) as session:
-        bus, seen = Bus(session, uav, HealthBook()), Passages()
-        seen.observe(bus)
-        bus.subscribe_keys(PREVIEW_IMAGE, lambda _key, _picture: None, at_once=True)
-        bus.alive("router")
-        yield bus, seen
-
-
 def _figures(flight: Flight, alone: Mapping[str, float], ways: Sequence[Way]) -> dict[str, float]:
     found = figures_of(flight.seen)
     found["dropped"] = float(flight.dropped)
-    found["cpu_cores"] = round(sum(usage.cpu_cores for usage in flight.used.values()), 2)
-    found["memory_mb"] = round(sum(usage.pss_mb for usage in flight.used.values()), 1)
-    found["over_budget"] = float(len(over_budget(flight.used, BUDGETS)))
+    found["cpu_cores"] = round(sum(usage.cpu_cores for usage in flight.aboard.values()), 2)
+    found["memory_mb"] = round(sum(usage.pss_mb for usage in flight.aboard.values()), 1)
+    found["over_budget"] = float(len(over_budget(flight.aboard, BUDGETS)))
     found["ready_s"] = round(flight.ready_s, 2)
     if alone:
         found["ready_alone_s_max"] = max(alone.values())
@@ -184,12 +122,12 @@ def _processes(flight: Flight) -> str:
         "| process | processor (cores) | budget | memory (MB) | budget | samples it missed |",
         "|---|---|---|---|---|---|",
     ]
-    for name, usage in flight.used.items():
+    for name, usage in flight.aboard.items():
         budget = BUDGETS[name]
         lines.append(
             f"| {name} | {usage.cpu_cores:.3f} | {budget.cpu_cores:.2f} | {usage.pss_mb:.0f} | {budget.pss_mb:.0f} | {_missed(flight, name)} |"
         )
-    over = over_budget(flight.used, BUDGETS)
+    over = over_budget(flight.aboard, BUDGETS)
     return "\n".join([*lines, "", f"Over budget by more than a fifth: {'; '.join(over) or 'none'}."])
 
 

@@ -48,10 +48,10 @@ def compare(frame: RgbdFrame, *, quick: bool) -> list[Way]:
     """Measure both ways with frames of this size, one after the other."""
     seconds = _QUICK_S if quick else _MEASURE_S
     size = (frame.intrinsics.width, frame.intrinsics.height)
-    return [measure(shared, size, seconds) for shared in (True, False)]
+    return [measure(shared=shared, size=size, seconds=seconds) for shared in (True, False)]
 
 
-def measure(shared: bool, size: tuple[int, int], seconds: float) -> Way:
+def measure(*, shared: bool, size: tuple[int, int], seconds: float) -> Way:
     """Send frames for a while.
 
     Raises:
@@ -79,14 +79,14 @@ def measure(shared: bool, size: tuple[int, int], seconds: float) -> Way:
                 for role in ("camera", *LISTENERS):
                     running.stop(role)
         ages = [json.loads(_out(folder, role).read_text(encoding="utf-8")) for role in LISTENERS]
-    return _way(shared, ages, {role: usage.cpu_cores for role, usage in used.items()})
+    return _way(ages, {role: usage.cpu_cores for role, usage in used.items()}, shared=shared)
 
 
 def _out(folder: Path, role: str) -> Path:
     return folder / f"{role}.ages.json"
 
 
-def _way(shared: bool, ages_ms: Sequence[Sequence[float]], cores: dict[str, float]) -> Way:
+def _way(ages_ms: Sequence[Sequence[float]], cores: dict[str, float], *, shared: bool) -> Way:
     counts = [len(ages) for ages in ages_ms]
     if not all(counts):
         raise InputError(f"frames came to {sum(n > 0 for n in counts)} of {len(counts)} listeners only")
