@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
 from schemas.envelope import Counter, Message, Name, Text
+from schemas.orders import CommandName
 
-CommandName = Literal["start", "hold", "resume", "abort", "land", "choose", "next"]
 Nonce = Annotated[bytes, Field(min_length=16, max_length=16)]
 
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import os
-from typing import Annotated, get_args
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 
-from schemas.command import CommandName, CommandReply
+from schemas.orders import CommandName
 from services.cli.options import AsJson, ConfigFile, Port, Settings, loaded
+
+if TYPE_CHECKING:
+    from schemas.command import CommandReply
 
 _NAMES: tuple[CommandName, ...] = get_args(CommandName)
 

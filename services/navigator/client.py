@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Protocol, TypeVar
 
 from schemas.codec import Wire
-from schemas.command import Command, CommandName, CommandReply, NonceReply, NonceRequest
+from schemas.command import Command, CommandReply, NonceReply, NonceRequest
+from schemas.orders import CommandName
 from schemas.topics import COMMAND, COMMAND_NONCE, Topic
 
 A = TypeVar("A", bound=Wire)

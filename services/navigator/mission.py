@@ -11,8 +11,8 @@ from typing import Literal
 
 import numpy as np
 
-from schemas.command import CommandName
 from schemas.navigation import MissionStateName
+from schemas.orders import CommandName
 from services.navigator.approaching import at_height
 from services.navigator.board import Board
 from services.navigator.config import NavigatorConfig

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from schemas.command import CommandName
 from schemas.navigation import MissionStateName
+from schemas.orders import CommandName
 from services.navigator.failsafe import AIRBORNE, Fault
 from services.navigator.values import Next
 

@@ -10,8 +10,9 @@ from typing import get_args
 import numpy as np
 
 from schemas.camera import RgbdFrame
-from schemas.command import Command, CommandName, CommandReply, NonceReply, NonceRequest
+from schemas.command import Command, CommandReply, NonceReply, NonceRequest
 from schemas.health import Health
+from schemas.orders import CommandName
 from schemas.slam import Pose
 from schemas.topics import (
     CAMERA_RGBD,

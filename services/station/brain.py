@@ -13,7 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from schemas.command import CommandName, CommandReply
+from schemas.command import CommandReply
+from schemas.orders import CommandName
 from services.station.aircraft import Aircraft
 from services.station.config import StationConfig
 from services.station.events import Event, EventLevel, EventLog

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from schemas.command import CommandName
+from schemas.orders import CommandName
 
 OPEN_TO_ALL: frozenset[CommandName] = frozenset({"hold"})
 

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from schemas.command import CommandName
 from schemas.envelope import DecodeError
+from schemas.orders import CommandName
 
 MAX_BYTES = 4096
 Uav = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.-]+$")]

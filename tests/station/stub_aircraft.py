@@ -12,8 +12,9 @@ from typing import get_args
 
 import numpy as np
 
-from schemas.command import Command, CommandName, CommandReply, NonceReply, NonceRequest
+from schemas.command import Command, CommandReply, NonceReply, NonceRequest
 from schemas.health import Health
+from schemas.orders import CommandName
 from schemas.sketch import SubmapSketch
 from schemas.topics import (
     COMMAND,
