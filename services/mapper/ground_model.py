@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.mapper.dense_map import MapSubmap, shift_m
+from services.mapper.footprints import Footprint, Footprints
 from services.mapper.ground_kernels import (
     BINS,
     STRAYS,
@@ -62,25 +63,13 @@ class GroundChange:
     gone: list[CellIndex]
 
 
-@dataclass(slots=True)
-class _Footprint:
-    """What one submap covers of the map."""
-
-    cells: NDArray[np.int64]
-    """(n, 2)."""
-    low: NDArray[np.int64]
-    high: NDArray[np.int64]
-    T_map_submap: Floats
-    points: int
-
-
 class GroundModel:
     """Cells by (column, row), multiples of ``cell_m`` in the map."""
 
     def __init__(self, cell_m: float) -> None:
         self.cell_m = cell_m
         self.cells: dict[CellIndex, GroundPlane] = {}
-        self._prints: dict[int, _Footprint] = {}
+        self._prints = Footprints()
         self._dirty: list[NDArray[np.int64]] = []
 
     @property
@@ -91,11 +80,11 @@ class GroundModel:
     @property
     def covered(self) -> set[CellIndex]:
         """The cells that hold points of the map, ground or not."""
-        return {(int(a), int(b)) for p in self._prints.values() for a, b in p.cells}
+        return {(int(a), int(b)) for p in self._prints for a, b in p.cells}
 
     def clear(self) -> None:
         """Begin a new map."""
-        self.cells, self._prints, self._dirty = {}, {}, []
+        self.cells, self._prints, self._dirty = {}, Footprints(), []
 
     def touch(self, submaps: Iterable[MapSubmap]) -> None:
         """Note that these submaps are new, moved or have lost points: where they were and where they are is to be redone.
@@ -107,13 +96,13 @@ class GroundModel:
             same = old is not None and old.points == len(submap.points_m)
             if same and old is not None and shift_m(old.T_map_submap, submap.T_map_submap) < _MOVE_M:
                 continue
-            self._prints.pop(submap.submap_id, None)
+            self._prints.drop(submap.submap_id)
             if old is not None:
                 self._dirty.append(old.cells)
             if len(submap.points_m) == 0:
                 continue
             new = self._footprint(submap)
-            self._prints[submap.submap_id] = new
+            self._prints.put(submap.submap_id, new)
             self._dirty.append(new.cells)
 
     def refresh(self, submaps: dict[int, MapSubmap]) -> GroundChange:
@@ -123,7 +112,8 @@ class GroundModel:
         dirty = np.unique(np.concatenate(self._dirty), axis=0)
         self._dirty = []
         low, high = dirty.min(axis=0) - _MARGIN, dirty.max(axis=0) + _MARGIN
-        near = [submaps[k] for k, p in self._prints.items() if k in submaps and (p.low <= high).all() and (p.high >= low).all()]  # fmt: skip
+        box = (int(low[0]), int(high[0]), int(low[1]), int(high[1]))
+        near = [submaps[k] for k in self._prints.near(box) if k in submaps]
         fresh = self._fit(near, low, high - low + 1)
         cells: dict[CellIndex, GroundPlane] = {}
         gone: list[CellIndex] = []
@@ -149,14 +139,14 @@ class GroundModel:
         dx, dy = x_m - (column + 0.5) * self.cell_m, y_m - (row + 0.5) * self.cell_m
         return plane.height_m + plane.slope_x * dx + plane.slope_y * dy
 
-    def _footprint(self, submap: MapSubmap) -> _Footprint:
+    def _footprint(self, submap: MapSubmap) -> Footprint:
         T = submap.T_map_submap
         plan = submap.points_m @ T[:2, :3].T.astype(np.float32) + T[:2, 3].astype(np.float32)
         at = np.floor(plan / self.cell_m).astype(np.int64)
         keys, counts = np.unique((at[:, 0] << 32) + (at[:, 1] + (1 << 31)), return_counts=True)
         keys = keys[counts >= min(_FEW_LEFT, int(counts.max()))]
         cells = np.stack([keys >> 32, (keys & 0xFFFFFFFF) - (1 << 31)], axis=1)
-        return _Footprint(cells, cells.min(axis=0), cells.max(axis=0), T, len(submap.points_m))
+        return Footprint(cells, T, len(submap.points_m))
 
     def _fit(self, submaps: list[MapSubmap], low: NDArray[np.int64], size: NDArray[np.int64]) -> Floats:
         shape, cell = (int(size[0]), int(size[1])), self.cell_m

@@ -141,11 +141,11 @@ class MapperService:
 
     def index(self) -> MapIndex:
         """Return what the map holds."""
-        held = [s for s in self.map.submaps.values() if len(s.points_m)]
+        held = [(s.submap_id, s.version, s.sent_graph) for s in self.map.submaps.values() if len(s.points_m)]
+        ids, versions, placed_by = zip(*held, strict=True) if held else ((), (), ())
         return MapIndex(
             stamp_ns=self._context.clock.now_ns(), map_id=self.map.map_id, epoch=self._epoch,
-            graph_version=self._graph_version, submap_ids=tuple(s.submap_id for s in held),
-            versions=tuple(s.version for s in held), placed_by=tuple(s.sent_graph for s in held),
+            graph_version=self._graph_version, submap_ids=ids, versions=versions, placed_by=placed_by,
             ground_sequence=self._ground.sequence,
         )  # fmt: skip
 

@@ -3,9 +3,13 @@
 Points enter only where their voxel is not full yet, so that looking again at the same place costs no memory; a voxel
 also takes what was seen from clearly nearer, because depth noise grows with the square of range. What leaves the map,
 or moves within it, gives its voxels back.
+
+The table grows segment by segment, each at another fill: no keyframe waits while millions of voxels are moved.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -16,19 +20,56 @@ from services.mapper.config import MapperConfig
 Matrix = NDArray[np.float64]
 Keys = NDArray[np.int64]
 
-_START_SLOTS = 1 << 16
+_SEGMENTS = 64
+_START_SLOTS = 1024
+"""Of a segment."""
+_SPARE_POINTS = 400_000
+"""The map's bound is kept after a keyframe has entered: so many points may be above it meanwhile."""
+_WORTH = 0.1
+"""A segment that cannot grow is tidied once such a share of it was given back; until then it refuses what is new."""
+_FREE = np.int64(0)
+"""Key of a slot that was never taken; the voxel that would have it is ten kilometres away."""
+
+
+class Table(NamedTuple):
+    """The slots: segment after segment, each with room for the largest it can become.
+
+    Untouched room is no memory: the system gives a page when it is first written to.
+    """
+
+    keys: Keys
+    counts: NDArray[np.uint8]
+    ranges: NDArray[np.float32]
+    slots: Keys
+    """(segments,) slots in use of each."""
+    used: Keys
+    """(segments,) slots that carry a key, live or given back."""
+    dead: Keys
+    """(segments,) those that were given back."""
 
 
 @njit(cache=True, nogil=True)
-def _slot(key: np.int64, table_keys: Keys) -> int:
-    mask = table_keys.shape[0] - 1
-    h = key * np.int64(
-        -7046029254386353131
-    )  # Fibonacci hashing (Knuth, TAOCP 3, 6.4): the upper bits are the mixed ones
-    at = (h ^ (h >> 32)) & mask
-    while table_keys[at] != -1 and table_keys[at] != key:
-        at = (at + 1) & mask
-    return int(at)
+def _slot(key: np.int64, t: Table) -> int:
+    """Return the slot of a key, or the free one where it belongs."""
+    # Fibonacci hashing (Knuth, TAOCP 3, 6.4): the upper bits are the mixed ones. The first choose the segment, the next
+    # the slot in it.
+    h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    segments = t.slots.shape[0]
+    whole = (h >> np.uint64(32)) * np.uint64(segments)
+    segment, part = np.int64(whole >> np.uint64(32)), whole & np.uint64(0xFFFFFFFF)
+    n = t.slots[segment]
+    base = segment * (t.keys.shape[0] // segments)
+    at = np.int64((part * np.uint64(n)) >> np.uint64(32))
+    while t.keys[base + at] != _FREE and t.keys[base + at] != key:
+        at += np.int64(1)
+        if at == n:
+            at = np.int64(0)
+    return int(base + at)
+
+
+@njit(cache=True, nogil=True)
+def _segment(at: int, t: Table) -> int:
+    return at // (t.keys.shape[0] // t.slots.shape[0])
 
 
 @njit(cache=True, nogil=True)
@@ -39,16 +80,59 @@ def _key(x: float, y: float, z: float, voxel: float, level: np.int64) -> np.int6
 
 
 @njit(cache=True, nogil=True)
+def _most(segment: int, slots: int, segments: int) -> int:
+    """Return how many keys a segment of so many slots takes: a third to two thirds of them, so that not all grow at once."""
+    return int(slots / 3.0 * 2.0 ** (segment / segments))
+
+
+@njit(cache=True, nogil=True)
+def _take_slot(at: int, key: np.int64, t: Table) -> int:
+    """Write a new key into its free slot; return its slot after the segment may have grown, -1 when there is no room."""
+    segments = t.slots.shape[0]
+    room = t.keys.shape[0] // segments
+    segment = _segment(at, t)
+    if t.used[segment] < _most(segment, t.slots[segment], segments):
+        t.keys[at] = key
+        t.used[segment] += 1
+        return at
+    if t.slots[segment] == room and t.dead[segment] < _WORTH * room:
+        return -1
+    _grow(segment, t)
+    at = _slot(key, t)
+    t.keys[at] = key
+    t.used[segment] += 1
+    return at
+
+
+@njit(cache=True, nogil=True)
+def _grow(segment: int, t: Table) -> None:
+    """Give a segment the slots that its live keys need; those that were given back are forgotten."""
+    segments = t.slots.shape[0]
+    room = t.keys.shape[0] // segments
+    base, n = segment * room, t.slots[segment]
+    live = np.flatnonzero(t.counts[base : base + n]) + base
+    keys, counts, ranges = t.keys[live], t.counts[live], t.ranges[live]
+    while n < room and len(live) >= 0.75 * _most(segment, n, segments):
+        n = min(2 * n, room)
+    t.slots[segment], t.used[segment], t.dead[segment] = n, len(live), 0
+    t.keys[base : base + n] = _FREE
+    t.counts[base : base + n] = 0
+    for i in range(len(live)):
+        at = _slot(keys[i], t)
+        t.keys[at], t.counts[at], t.ranges[at] = keys[i], counts[i], ranges[i]
+
+
+@njit(cache=True, nogil=True)
 def _known_along(
     x: float, y: float, z: float, dx: float, dy: float, dz: float, steps: int, voxel: float, level: np.int64,
-    farthest: float, table_keys: Keys, table_count: NDArray[np.uint8], table_range: NDArray[np.float32],
+    farthest: float, t: Table,
 ) -> bool:  # fmt: skip
     """Tell whether a voxel within so many steps along the ray holds a point seen from nearer than ``farthest``."""
     for step in range(1, steps + 1):
         for f in (-float(step), float(step)):
             key = _key(x + f * dx, y + f * dy, z + f * dz, voxel, level)
-            at = _slot(key, table_keys)
-            if table_keys[at] == key and table_count[at] > 0 and table_range[at] <= farthest:
+            at = _slot(key, t)
+            if t.keys[at] == key and t.counts[at] > 0 and t.ranges[at] <= farthest:
                 return True
     return False
 
@@ -56,15 +140,14 @@ def _known_along(
 @njit(cache=True, nogil=True)
 def _admit(
     points: NDArray[np.float32], T: Matrix, lows: NDArray[np.float32], cell: float, fine_low: float, fine_high: float,
-    fine: float, coarse: float, per_voxel: int, nearer: float, table_keys: Keys, table_count: NDArray[np.uint8],
-    table_range: NDArray[np.float32], shell: float, keep: NDArray[np.bool_], keys: Keys,
-) -> int:  # fmt: skip
-    """Enter points; mark those that their voxel takes and name each one's voxel. Return the number of new slots.
+    fine: float, coarse: float, per_voxel: int, nearer: float, t: Table, shell: float, keep: NDArray[np.bool_],
+    keys: Keys,
+) -> None:  # fmt: skip
+    """Enter points; mark those that their voxel takes and name each one's voxel.
 
     With ``shell`` above zero a point is known already when a voxel is taken within ``shell r^2`` along its ray.
     """
     half = lows.shape[0] // 2
-    fresh = 0
     for i in range(points.shape[0]):
         px, py, pz = points[i, 0], points[i, 1], points[i, 2]
         x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
@@ -77,58 +160,48 @@ def _admit(
             voxel, level = fine, np.int64(0)
         key = _key(x, y, z, voxel, level)
         keys[i] = key
-        at = _slot(key, table_keys)
+        keep[i] = False
+        at = _slot(key, t)
         r = np.sqrt(px * px + py * py + pz * pz)
-        if shell > 0.0 and table_count[at] == 0:
+        if shell > 0.0 and t.counts[at] == 0:
             s = voxel / max(r, 0.1)
             dx, dy, dz = s * (x - T[0, 3]), s * (y - T[1, 3]), s * (z - T[2, 3])
             steps = int(shell * r * r / voxel)
-            if _known_along(x, y, z, dx, dy, dz, steps, voxel, level, r / nearer, table_keys, table_count, table_range):
-                keep[i] = False
+            if _known_along(x, y, z, dx, dy, dz, steps, voxel, level, r / nearer, t):
                 continue
-        if table_keys[at] == -1:
-            table_keys[at] = key
-            fresh += 1
-        if table_count[at] == 0:
-            table_count[at] = 1
-            table_range[at] = r
+        if t.keys[at] == _FREE:
+            at = _take_slot(at, key, t)
+            if at < 0:
+                continue
+        elif t.counts[at] == 0:
+            t.dead[_segment(at, t)] -= 1
+        if t.counts[at] == 0:
+            t.counts[at] = 1
+            t.ranges[at] = r
             keep[i] = True
-        elif table_count[at] < per_voxel or r < nearer * table_range[at]:
-            table_count[at] = min(255, table_count[at] + 1)
-            table_range[at] = min(table_range[at], r)
+        elif t.counts[at] < per_voxel or r < nearer * t.ranges[at]:
+            t.counts[at] = min(255, t.counts[at] + 1)
+            t.ranges[at] = min(t.ranges[at], r)
             keep[i] = True
-        else:
-            keep[i] = False
-    return fresh
 
 
 @njit(cache=True, nogil=True)
-def _release(keys: Keys, table_keys: Keys, table_count: NDArray[np.uint8]) -> None:
+def _release(keys: Keys, t: Table) -> None:
     for i in range(keys.shape[0]):
-        at = _slot(keys[i], table_keys)
-        if table_keys[at] == keys[i] and table_count[at] > 0:
-            table_count[at] -= 1
+        at = _slot(keys[i], t)
+        if t.keys[at] == keys[i] and t.counts[at] > 0:
+            t.counts[at] -= 1
+            t.dead[_segment(at, t)] += t.counts[at] == 0
 
 
 @njit(cache=True, nogil=True)
-def _take(keys: Keys, table_keys: Keys, table_count: NDArray[np.uint8]) -> None:
+def _take(keys: Keys, t: Table) -> None:
     """Enter points into voxels that are known already, full or not."""
     for i in range(keys.shape[0]):
-        at = _slot(keys[i], table_keys)
-        if table_keys[at] == keys[i]:
-            table_count[at] = min(255, table_count[at] + 1)
-
-
-@njit(cache=True, nogil=True)
-def _refill(
-    keys: Keys, counts: NDArray[np.uint8], ranges: NDArray[np.float32], table_keys: Keys,
-    table_count: NDArray[np.uint8], table_range: NDArray[np.float32],
-) -> None:  # fmt: skip
-    for i in range(keys.shape[0]):
-        at = _slot(keys[i], table_keys)
-        table_keys[at] = keys[i]
-        table_count[at] = counts[i]
-        table_range[at] = ranges[i]
+        at = _slot(keys[i], t)
+        if t.keys[at] == keys[i]:
+            t.dead[_segment(at, t)] -= t.counts[at] == 0
+            t.counts[at] = min(255, t.counts[at] + 1)
 
 
 class VoxelTable:
@@ -136,14 +209,20 @@ class VoxelTable:
 
     def __init__(self, config: MapperConfig) -> None:
         self._config = config
-        self._used = 0
-        """Slots that carry a key, live or given back."""
-        self._clear(_START_SLOTS)
+        room = _START_SLOTS
+        while room * _SEGMENTS < 3 * (config.max_points + _SPARE_POINTS):
+            room *= 2
+        total = room * _SEGMENTS
+        self._table = Table(
+            np.zeros(total, np.int64), np.zeros(total, np.uint8), np.empty(total, np.float32),
+            np.full(_SEGMENTS, _START_SLOTS), np.zeros(_SEGMENTS, np.int64), np.zeros(_SEGMENTS, np.int64),
+        )  # fmt: skip
 
     @property
     def nbytes(self) -> int:
-        """Memory of the table."""
-        return int(self._keys.nbytes + self._counts.nbytes + self._ranges.nbytes)
+        """Memory of the slots in use."""
+        each = self._table.keys.itemsize + self._table.counts.itemsize + self._table.ranges.itemsize
+        return each * int(self._table.slots.sum())
 
     def admit(
         self, points_m: NDArray[np.float32], T_map_points: Matrix, lows_m: NDArray[np.float32], shell_per_m: float = 0.0
@@ -157,38 +236,18 @@ class VoxelTable:
             shell_per_m: times the range squared, how far along its ray a point may lie from a taken voxel and be known.
         """
         n = len(points_m)
-        self.reserve(n)
         keep, keys = np.empty(n, dtype=np.bool_), np.empty(n, dtype=np.int64)
         c = self._config
-        self._used += int(_admit(
+        _admit(
             points_m, T_map_points, lows_m, c.ground_cell_m, c.fine_low_m, c.fine_high_m, c.voxel_m, c.coarse_voxel_m,
-            c.per_voxel, c.nearer, self._keys, self._counts, self._ranges, shell_per_m, keep, keys,
-        ))  # fmt: skip
+            c.per_voxel, c.nearer, self._table, shell_per_m, keep, keys,
+        )  # fmt: skip
         return keep, keys
 
     def release(self, keys: Keys) -> None:
         """Give back the voxels of points that leave or move."""
-        _release(keys, self._keys, self._counts)
+        _release(keys, self._table)
 
     def take(self, keys: Keys) -> None:
         """Enter points that were refused by full voxels after all."""
-        _take(keys, self._keys, self._counts)
-
-    def reserve(self, more: int) -> None:
-        """Grow so that the table stays at most two thirds full; voxels that were given back are forgotten then."""
-        if 1.5 * (self._used + more) <= len(self._keys):
-            return
-        live = self._counts > 0
-        keys, counts, ranges = self._keys[live], self._counts[live], self._ranges[live]
-        slots = _START_SLOTS
-        while 1.5 * (len(keys) + more) > slots:
-            slots *= 2
-        self._clear(slots)
-        _refill(keys, counts, ranges, self._keys, self._counts, self._ranges)
-        self._used = len(keys)
-
-    def _clear(self, slots: int) -> None:
-        self._keys: Keys = np.full(slots, -1, dtype=np.int64)
-        self._counts = np.zeros(slots, dtype=np.uint8)
-        self._ranges = np.zeros(slots, dtype=np.float32)
-        self._used = 0
+        _take(keys, self._table)

@@ -26,7 +26,6 @@ def warm() -> None:
     )
     dense = DenseMap(MapperConfig())
     dense.add(0, 0, cloud, np.eye(4))
-    dense._voxels.reserve(100_000)  # noqa: SLF001 - compiles the growing of the table as well
     shifted = np.eye(4)
     shifted[2, 3] = 1.0
     dense.move({0: shifted})
