@@ -28,6 +28,18 @@ _VOID_PX = 16
 
 
 @dataclass(slots=True)
+class Roll:
+    """What the shutter did to features."""
+
+    read: F64
+    """(N, 2) undistorted pixels as they were read."""
+    row: F64
+    """(N,) when their row was read, as a share of the readout since the middle row's moment."""
+    slope: F64
+    """(N, 2) how far they belong from ``read``, pixels per second of readout."""
+
+
+@dataclass(slots=True)
 class Features:
     """Features of one image, in one order for all arrays (N first), with the grid that finds them by place."""
 
@@ -48,6 +60,7 @@ class Features:
     """(N,) inverse variance of the disparity, 0 = none."""
     cell_start: I32
     cell_items: I32
+    roll: Roll | None = None
 
     def __len__(self) -> int:
         return len(self.uv)
@@ -158,7 +171,9 @@ class Extractor:
             depth_m, xy, self._config.min_depth_m, 10.0 * self._config.max_depth_m, self._bf,
             self._config.disparity_sigma_px,
         )  # fmt: skip
-        return self._build(self.undistort(xy), octave, angle, desc, depth, info, far)
+        features = self._build(self.undistort(xy), octave, angle, desc, depth, info, far)
+        features.roll = Roll(features.uv, xy[:, 1] / self._intrinsics.height - 0.5, np.zeros_like(xy))
+        return features
 
     def _describe(self, grey: U8, xy: F64, angle: F64, octave: I32) -> tuple[NDArray[np.uint64], NDArray[np.int64]]:
         """Return descriptors (M, 4) and which corners (M,) they belong to: OpenCV drops those it finds near the edge."""

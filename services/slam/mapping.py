@@ -60,7 +60,7 @@ class Mapping:
         self.revision = 0
         """Up by one whenever poses of keyframes were corrected."""
         self.why: GraphReason = "local_ba"
-        self._owed = False
+        self.owed = False
         """A large adjustment was cut short."""
         self.turns = 0
         """Up by one whenever the whole map was turned."""
@@ -103,8 +103,8 @@ class Mapping:
 
     def pay(self, k: int) -> None:
         """Do the large adjustment that was cut short, unless keyframes wait: then the next one asks again."""
-        if self._owed and not self.hurried():
-            self._owed = False
+        if self.owed and not self.hurried():
+            self.owed = False
             self.adjust_all(k)
 
     def _create(self, k: int) -> None:
@@ -211,7 +211,7 @@ class Mapping:
             else:
                 adjust_large(problem, camera, part.free, rounds, robust, self.hurried)
                 if self.hurried():  # what was reached is taken, but not yet fit to say what does not fit
-                    self._owed, problem.use[:] = True, True
+                    self.owed, problem.use[:] = True, True
                     break
             gate(chi_squares(problem, camera), problem.info, 1.0, problem.use)
         with self.step():

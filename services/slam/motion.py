@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +22,17 @@ _TURN_RAD_S = 7.0
 """Hands and aircraft do not exceed these; a pose that asks for more is a wrong pose."""
 
 
+@dataclass(frozen=True, slots=True)
+class Velocity:
+    """Of the camera, in its own axes."""
+
+    v_m_s: F64
+    w_rad_s: F64
+
+
+STILL = Velocity(np.zeros(3), np.zeros(3))
+
+
 class Motion:
     """Constant velocity in the camera's frame, over any time between frames."""
 
@@ -29,6 +42,7 @@ class Motion:
         self._w_rad_s = np.zeros(3)
         self._sure = False
         """Whether a velocity has been measured since tracking (re)started."""
+        self._step_s = 0.0
 
     def forget(self) -> None:
         """Start anew: the last pose has nothing to do with the next."""
@@ -41,6 +55,27 @@ class Motion:
         if dt_s > _KEEPS_S:
             return np.eye(4)
         return pose(exp_rotation(self._w_rad_s * dt_s), self._v_m_s * dt_s)
+
+    def velocity(self, stamp_ns: int, T_last_camera: F64 | None = None) -> Velocity:
+        """Return the camera's velocity at a stamp.
+
+        Without ``T_last_camera`` that of the last step goes on; with it, that of this step goes on changing as it did.
+        """
+        dt_s = self._since(stamp_ns)
+        if dt_s > _KEEPS_S:
+            return STILL
+        if T_last_camera is None or dt_s <= 0.0:
+            return Velocity(self._v_m_s, self._w_rad_s)
+        v_m_s, w_rad_s = T_last_camera[:3, 3] / dt_s, log_rotation(T_last_camera[:3, :3]) / dt_s
+        if not self._sure:
+            return Velocity(v_m_s, w_rad_s)
+        share = dt_s / (dt_s + self._step_s)
+        return Velocity(v_m_s + share * (v_m_s - self._v_m_s), w_rad_s + share * (w_rad_s - self._w_rad_s))
+
+    @property
+    def measured(self) -> Velocity | None:
+        """Return the velocity of the last step, None when there was none."""
+        return Velocity(self._v_m_s, self._w_rad_s) if self._sure else None
 
     def plausible(self, stamp_ns: int, T_last_camera: F64) -> bool:
         """Return whether the camera can have moved so since the last frame."""
@@ -64,7 +99,7 @@ class Motion:
         else:
             self._v_m_s = T_last_camera[:3, 3] / dt_s
             self._w_rad_s = log_rotation(T_last_camera[:3, :3]) / dt_s
-            self._sure = True
+            self._sure, self._step_s = True, dt_s
         self._stamp_ns = stamp_ns
 
     def _since(self, stamp_ns: int) -> float:

@@ -26,9 +26,10 @@ from services.slam.keyframing import KeyframeRule
 from services.slam.links import shared_counts
 from services.slam.loops import Loops
 from services.slam.mapping import Mapping
-from services.slam.motion import Motion, can_have_moved
+from services.slam.motion import STILL, Motion, Velocity, can_have_moved
 from services.slam.places import Places
 from services.slam.results import GraphUpdate, NewKeyframe, TrackResult, map_covariance
+from services.slam.shutter import Shutter
 from services.slam.tracking import Tracked, Tracking, moved
 from services.slam.trail import Trail
 from services.slam.verify import Verifier
@@ -72,6 +73,7 @@ class Slam:
         """Stamp, specific force and the autopilot's up of the last frame, when it was located."""
         self._last: Tracked | None = None
         self._motion = Motion()
+        self.shutter = Shutter(self.atlas, camera)
         self._verifier = Verifier(intrinsics, camera)
         self._found: tuple[int, Tracked] | None = None
         """Stamp and frame of a place found blind that waits for a second frame to say the same."""
@@ -163,16 +165,29 @@ class Slam:
         last = self._last
         if last is None:
             return None
+        self.shutter.straighten(features, self._motion.velocity(stamp_ns))
         predicted = inverse(self._motion.predict(stamp_ns)) @ pose(last.R, last.t)
         R = orthonormal(predicted[:3, :3])
         frame = self.tracking.follow(last, features, np.ascontiguousarray(R), predicted[:3, 3].copy())
         if frame is None:
             return None
+        velocity = self._motion.velocity(stamp_ns, _step(last, frame))
+        self.shutter.straighten(features, velocity)
         joined = self.tracking.join_map(frame)
         if joined is None or joined[0].inliers < self.config.min_inliers:
             return None
+        if self.shutter.learn(joined[0]):
+            self.mapping.owed = True
+        self._unroll(joined[0], velocity)
         believed = self._motion.plausible(stamp_ns, _step(last, joined[0]))
         return joined[0] if believed and self._verifier.believes(joined[0], depth_m, blind=False) else None
+
+    def _unroll(self, frame: Tracked, velocity: Velocity) -> None:
+        """Place the features by the velocity that the frame itself tells, and the pose by them."""
+        if self.shutter.readout_s == 0.0:
+            return
+        self.shutter.straighten(frame.features, self.shutter.turn_rate(frame, velocity))
+        self.tracking.again(frame)
 
     def _level_map(self) -> GraphUpdate | None:
         """Turn the map upright when gravity is known better by the last frame; return the new graph."""
@@ -201,6 +216,7 @@ class Slam:
 
         When in doubt it is not believed before a second frame was found where the camera can be by then.
         """
+        self.shutter.straighten(features, STILL)
         frame = self.loops.relocate(features)
         if frame is None or not self._verifier.believes(frame, depth_m, blind=True):
             self._found = None
@@ -223,6 +239,7 @@ class Slam:
     def _accept(self, stamp_ns: int, frame: Tracked, graph: GraphUpdate | None) -> TrackResult:
         """Remember a frame that has its pose, and make a keyframe of it when the map needs one."""
         self._motion.update(stamp_ns, None if self._last is None else _step(self._last, frame))
+        self.shutter.settle(self._motion.measured)
         new: list[NewKeyframe] = []
         if self.graph_version == 0 or self._rule.wants(frame, self.crew.waiting):
             new, graph = self._make_keyframe(frame, graph)
@@ -236,6 +253,7 @@ class Slam:
         """Put the frame into the map as a keyframe; the frame takes over what mapping has made of it."""
         k = self.mapping.insert(frame.features, frame.R, frame.t, frame.point)
         serial = self.atlas.newest_serial
+        self.shutter.keep(serial, frame.features, self._motion.measured)
         self.crew.submit(lambda: self._settle(k))
         kf = self.atlas.keyframes
         settled = self.mapping.revision != self._revision

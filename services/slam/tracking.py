@@ -176,6 +176,19 @@ class Tracking:
         kept[queries[inliers[:, 0]]] = match[queries[inliers[:, 0]]]
         return self._locate(features, np.ascontiguousarray(R), np.ascontiguousarray(t[:, 0]), world, kept, known, last)
 
+    def again(self, frame: Tracked) -> None:
+        """Refine a frame's pose by the points it sees, in place, after its features were moved."""
+        index = np.flatnonzero(frame.point >= 0)
+        ids, p = frame.point[index], self.atlas.points
+        R, t = frame.R.copy(), frame.t.copy()
+        doubt = far_doubt(p, self.atlas.keyframes, ids, R, t, self.camera.array[0], self.far.sigma_inverse_m)
+        count, use, H, chi2 = self.refine(frame.features, R, t, p.pos[ids], index, doubt)
+        if count < 6:
+            return
+        frame.R, frame.t, frame.information, frame.chi2 = R, t, H, chi2
+        frame.inliers = count
+        frame.point[index[~use]] = -1
+
     def join_map(self, frame: Tracked) -> tuple[Tracked, int] | None:
         """Match the frame with the local map and refine; returns it and its best keyframe slot, None when that fails."""
         atlas = self.atlas

@@ -9,6 +9,7 @@ from services.common.numba_start import load_numba
 from services.slam.bundle import adjust_large
 from services.slam.config import SlamConfig
 from services.slam.keeper import rejoin, whole_map
+from services.slam.shutter import turn_slopes
 from services.slam.slam import Slam
 
 _done = False
@@ -32,6 +33,7 @@ def warm() -> None:
     _warm_loop(slam)
     _warm_keeping(slam)
     _warm_large(slam)
+    turn_slopes(np.zeros((1, 2)), np.zeros(1), slam.camera.array)
     slam.polish()
     slam.mapping.retire(int(slam.atlas.slots[1]))
     slam.final_trajectory()

@@ -32,9 +32,10 @@ def _rays() -> F64:
     return np.stack([(u - i.cx) / i.fx, (v - i.cy) / i.fy, np.ones(u.shape)], axis=-1).reshape(-1, 3)
 
 
-def look(T_world_camera: F64) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Return grey (H, W) and depth (H, W), metres, seen from a pose inside the room (centre at the origin)."""
-    d = _rays() @ T_world_camera[:3, :3].T
+def look(T_world_camera: F64, rows: slice = slice(None)) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Return ``rows`` of grey (H, W) and depth (H, W), metres, seen from a pose inside the room (centre at the origin)."""
+    rays = _rays().reshape(INTRINSICS.height, INTRINSICS.width, 3)[rows].reshape(-1, 3)
+    d = rays @ T_world_camera[:3, :3].T
     o = T_world_camera[:3, 3]
     with np.errstate(divide="ignore"):
         reach = (np.where(d > 0.0, _HALF_M, -_HALF_M) - o) / d
@@ -51,7 +52,7 @@ def look(T_world_camera: F64) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         walls[side, i, j] * (1 - p) * (1 - q) + walls[side, i + 1, j] * p * (1 - q)
         + walls[side, i, j + 1] * (1 - p) * q + walls[side, i + 1, j + 1] * p * q
     )  # fmt: skip
-    shape = (INTRINSICS.height, INTRINSICS.width)
+    shape = (-1, INTRINSICS.width)
     return grey.reshape(shape).astype(np.uint8), depth.reshape(shape).astype(np.float32)
 
 
