@@ -20,6 +20,7 @@ from schemas.preview import PreviewImage
 from schemas.simulation import SimClock, SimTruth
 from schemas.sketch import SubmapSketch
 from schemas.slam import Graph, Keyframe, Pose
+from schemas.timekeeping import ClockRequest
 from schemas.trees import Target, TreeList
 from schemas.vehicle import VehicleState
 
@@ -97,7 +98,7 @@ ANY = "*"
 
 CAMERA_RGBD = Topic("camera/rgbd", RgbdFrame, "camera", ("slam", "refiner", "navigator", "preview"), 15, 1.0, _H, _LATEST, "data",
                     description="colour and registered depth, raw")  # fmt: skip
-CAMERA_COMPRESSED = Topic("camera/rgbd_compressed", RgbdFrame, "camera", ("slam", "refiner", "recorder"), 0, None, _A, _LATEST, "data_low",
+CAMERA_COMPRESSED = Topic("camera/rgbd_compressed", RgbdFrame, "camera", ("slam", "refiner", "navigator", "recorder"), 0, None, _A, _LATEST, "data_low",
                           description="the same as JPEG and PNG, sent only while somebody listens")  # fmt: skip
 SLAM_POSE = Topic("slam/pose", Pose, "slam", ("refiner", "detector", "navigator", "autopilot", "simulator", "station", "preview"), 15, 0.5, _R, _STREAM,
                   "interactive_high", radio_hz=5, express=True, description="camera in map for each frame, with covariance")  # fmt: skip
@@ -127,9 +128,11 @@ COMMAND = Topic("cmd/*", Command, "station", ("navigator",), 0, None, _R, _QUERY
                 description="start hold resume abort land choose next: the reply says accepted or why not")  # fmt: skip
 COMMAND_NONCE = Topic("nonce", NonceRequest, "station", ("navigator",), 0, None, _R, _QUERY, "real_time", express=True,
                       recorded=False, description="ask the aircraft for a nonce to command with")  # fmt: skip
+CLOCK = Topic("clock", ClockRequest, ANY, ("router",), 0, None, _R, _QUERY, "real_time", express=True, recorded=False,
+              description="ask the router for the time: all machines' clocks are brought to its own")  # fmt: skip
 PREVIEW_IMAGE = Topic("preview/image", PreviewImage, "preview", ("station",), 5, None, _R, _LATEST, "background",
                       recorded=False, description="small picture with the overlay, sent only while somebody looks")  # fmt: skip
-HEALTH = Topic("health/*", Health, ANY, ("station",), 1, 3.0, _R, _STREAM, "data_high",
+HEALTH = Topic("health/*", Health, ANY, ("navigator", "router", "station"), 1, 3.0, _R, _STREAM, "data_high",
                description="each service's own account of itself")  # fmt: skip
 SIM_RGBD = Topic("sim/rgbd", RgbdFrame, "simulator", ("camera",), 15, None, _H, _LATEST, recorded=False,
                  description="the simulated sensor's frames, for the camera service")  # fmt: skip
@@ -140,7 +143,7 @@ SIM_TRUTH = Topic("sim/truth", SimTruth, "simulator", ("evaluate",), 15, None, _
 
 TOPICS: tuple[Topic, ...] = (
     CAMERA_RGBD, CAMERA_COMPRESSED, SLAM_POSE, SLAM_KEYFRAME, SLAM_GRAPH, MAP_CLOUD, MAP_SKETCH, MAP_INDEX, MAP_GROUND, TREES_LIST, TREES_TARGET,
-    MISSION_STATE, MISSION_GUIDANCE, VEHICLE_STATE, COMMAND, COMMAND_NONCE, PREVIEW_IMAGE, HEALTH, SIM_RGBD, SIM_CLOCK, SIM_TRUTH,
+    MISSION_STATE, MISSION_GUIDANCE, VEHICLE_STATE, COMMAND, COMMAND_NONCE, CLOCK, PREVIEW_IMAGE, HEALTH, SIM_RGBD, SIM_CLOCK, SIM_TRUTH,
 )  # fmt: skip
 
 LIVE = "live/*"

@@ -14,6 +14,7 @@ from schemas.preview import PreviewImage
 from schemas.simulation import SimClock, SimTruth, TrueTree
 from schemas.sketch import SubmapSketch
 from schemas.slam import Graph, GraphNode, Keyframe, Pose, Transform
+from schemas.timekeeping import ClockReply, ClockRequest
 from schemas.trees import Target, Tree, TreeList
 from schemas.vehicle import VehicleState
 
@@ -94,6 +95,8 @@ def all_messages() -> dict[str, Wire]:
         NonceReply(nonce=bytes(range(16)), valid_s=30.0, next_sequence=1),
         Command(name="choose", sender="station", nonce=bytes(range(16)), sequence=1, tree_id=7),
         CommandReply(accepted=False, reason="no tree 7 in the list", state="idle"),
+        ClockRequest(sender="slam"),
+        ClockReply(stamp_ns=66_000_000),
         SimClock(stamp_ns=66_000_000, seq=1, phase="running", frames=2),
         SimTruth(stamp_ns=66_000_000, seq=1, scene="single-01", T_map_camera=POSE, trees=(true_tree,), touched=0,
                  clearance_m=1.2),

@@ -13,6 +13,7 @@ from services.camera.config import CameraConfig
 from services.camera.sources import BadFrame, ConditionedSource, open_source
 from services.camera.warm import warm
 from services.camera.watch import StreamWatch
+from services.common.clock import on_clock_ns
 from services.common.context import Context
 
 _TICK_S = 0.005
@@ -128,7 +129,12 @@ class Replay:
             self._service.drop(
                 f"the camera has sent one and the same picture {self._source.watch.repeated_in_a_row} times"
             )
-        elif self._source.paced and self._config.restamp:
+        elif not self._source.paced:
+            # a sensor's stamps are the machine's, whose clock somebody may set while we fly
+            self._service.publish(
+                dataclasses.replace(item, stamp_ns=on_clock_ns(self._service.context.clock, item.stamp_ns))
+            )
+        elif self._config.restamp:
             self._service.publish(dataclasses.replace(item, stamp_ns=self._due_ns(item.stamp_ns)))
         else:
             self._service.publish(item)

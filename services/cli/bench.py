@@ -33,6 +33,7 @@ def bench(
     data: DataFolder = None,
     scenes: Annotated[str, typer.Option("--scenes", help="Only these scenes, names separated by commas")] = "",
     count: Annotated[int | None, typer.Option("--count", min=1, help="How many runs (missions)")] = None,
+    minutes: Annotated[float | None, typer.Option("--minutes", min=0.5, help="How long (soak)")] = None,
     rendered: Annotated[
         bool, typer.Option("--rendered", help="With rendered images, real processes (missions)")
     ] = False,
@@ -48,7 +49,7 @@ def bench(
     run = load_bench(name)
     options = BenchOptions(
         seed=seed, out=out, scenes=tuple(part.strip() for part in scenes.split(",") if part.strip()), quick=quick,
-        keep_sequences=keep_sequences, count=count, doc=doc, rendered=rendered,
+        keep_sequences=keep_sequences, count=count, minutes=minutes, doc=doc, rendered=rendered,
         tell=lambda line: typer.echo(line, err=True), **({"data": data} if data is not None else {}),
     )  # fmt: skip
     report = run(options)

@@ -18,6 +18,11 @@ from services.cli.run_config import SupervisorConfig
 LOG = logging.getLogger(__name__)
 
 _EXIT_INPUT = 2
+_ROUTER = "router"
+_ROUTER_SILENT_S = 3.0
+"""All health comes by way of the router: when its own stays away, that of the others says nothing."""
+EXPENDABLE = frozenset({"recorder", "preview", "station"})
+"""No flight needs them: once all was well they are tried again for ever."""
 
 
 class Process(Protocol):
@@ -53,6 +58,8 @@ class Child:
     """Without having become ready in between."""
     start_at_s: float = 0.0
     last_fault: str = ""
+    was_ready: bool = False
+    """At any time: what it is started with was good once."""
 
     @property
     def alive(self) -> bool:
@@ -84,8 +91,10 @@ class Supervisor:
             return  # of a process that was replaced
         child.heard_s = self.now_s()
         if state in {"ready", "degraded"} and not child.ready:
-            child.ready = True
+            child.ready = child.was_ready = True
             child.deaths_in_a_row = 0
+            if name == _ROUTER:
+                self._hear_anew()
 
     @property
     def all_ready(self) -> bool:
@@ -126,11 +135,24 @@ class Supervisor:
         child.started_s = child.heard_s = self.now_s()
         child.ready = False
 
+    def _hear_anew(self) -> None:
+        """Give everybody time: while the router was away nobody could be heard."""
+        for child in self.children.values():
+            child.heard_s = self.now_s()
+
+    @property
+    def _deaf(self) -> bool:
+        """Whether the others' health would not reach us."""
+        router = self.children.get(_ROUTER)
+        return router is not None and (not router.ready or self.now_s() - router.heard_s > _ROUTER_SILENT_S)
+
     def _hung(self, child: Child) -> str:
         """Return in words why the running child counts as hung, or an empty text."""
         if not child.ready:
             waited_s = self.now_s() - child.started_s
             return f"was not ready after {waited_s:.0f} s" if waited_s > self.limits.start_within_s else ""
+        if child.name != _ROUTER and self._deaf:
+            return ""
         silent_s = self.now_s() - child.heard_s
         return f"was silent for {silent_s:.0f} s" if silent_s > self.limits.hung_after_s else ""
 
@@ -140,7 +162,9 @@ class Supervisor:
         child.deaths_in_a_row += 0 if child.ready else 1
         child.ready = False
         child.restarts += 1
-        if code == _EXIT_INPUT or child.deaths_in_a_row >= self.limits.give_up_after:
+        refused = code == _EXIT_INPUT and not child.was_ready
+        hopeless = child.deaths_in_a_row >= self.limits.give_up_after
+        if refused or (hopeless and not (child.was_ready and child.name in EXPENDABLE)):
             self.given_up = child
         pause_s = min(self.limits.backoff_s * 2 ** max(0, child.deaths_in_a_row - 1), self.limits.backoff_max_s)
         child.start_at_s = self.now_s() + pause_s

@@ -6,6 +6,9 @@ import threading
 import time
 from typing import Protocol
 
+SLEW = 1e-3
+"""Seconds per second by which a running clock is brought to the router's: PX4's own filter follows that."""
+
 
 class Clock(Protocol):
     """Time as the services know it, nanoseconds."""
@@ -21,16 +24,53 @@ class Clock(Protocol):
 
 
 class WallClock:
-    """The machine's clock, made monotonic: it starts at the wall time and never steps afterwards."""
+    """The machine's clock, made monotonic: it starts at the wall time and never steps by itself afterwards.
+
+    ``correct`` brings it to the router's: a first time at once, then slowly, so that nobody sees time run back or jump.
+    """
 
     simulated = False
 
-    def __init__(self) -> None:
-        self._offset_ns = time.time_ns() - time.monotonic_ns()
+    def __init__(self, ahead_s: float = 0.0) -> None:
+        """Start at the machine's time; ``ahead_s`` is added, for tests of machines whose clocks differ."""
+        self._offset_ns = time.time_ns() - time.monotonic_ns() + round(ahead_s * 1e9)
+        self._goal_ns = self._corrected_ns = 0
+        self._slewed_ns = time.monotonic_ns()
+        self._lock = threading.Lock()
 
     def now_ns(self) -> int:
         """Return the present time."""
+        with self._lock:
+            now_ns = time.monotonic_ns()
+            most_ns = int((now_ns - self._slewed_ns) * SLEW)
+            if most_ns:  # else the little that is due would be forgotten
+                left_ns = self._goal_ns - self._corrected_ns
+                self._corrected_ns += max(-most_ns, min(most_ns, left_ns))
+                self._slewed_ns = now_ns
+            return now_ns + self._offset_ns + self._corrected_ns
+
+    def machine_ns(self) -> int:
+        """Return the time without any correction."""
         return time.monotonic_ns() + self._offset_ns
+
+    @property
+    def correction_ns(self) -> int:
+        """What is added at present."""
+        return self._corrected_ns
+
+    def correct(self, correction_ns: int, *, at_once: bool = False) -> int:
+        """Aim at another correction; ``at_once`` steps there. Return by how much the time stepped, ns."""
+        with self._lock:
+            self._goal_ns = correction_ns
+            if not at_once:
+                return 0
+            step_ns, self._corrected_ns = correction_ns - self._corrected_ns, correction_ns
+            return step_ns
+
+
+def on_clock_ns(clock: Clock, machine_stamp_ns: int) -> int:
+    """Return a stamp of this machine's clock as ``clock`` counts: another zero, or the machine's clock was set since."""
+    return machine_stamp_ns + clock.now_ns() - time.time_ns()
 
 
 class SimulatedClock:

@@ -32,6 +32,8 @@ class TreedockConfig(BaseModel):
     """Name of the aircraft: a chunk of every key."""
     clock: Literal["wall", "sim"] = "wall"
     """``sim``: time is what ``sim/clock`` says."""
+    clock_ahead_s: float = 0.0
+    """Added to this machine's clock: for tests of machines whose clocks differ."""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     router: RouterConfig = RouterConfig()
     security: SecurityConfig = SecurityConfig()

@@ -21,6 +21,7 @@ from schemas.topics import HEALTH, SIM_CLOCK, TOPICS, Topic
 from services.common import sd_notify
 from services.common.bus import Bus
 from services.common.clock import Clock, SimulatedClock, WallClock
+from services.common.clock_sync import ClockSync, tell
 from services.common.config import TreedockConfig
 from services.common.context import HealthBook
 from services.common.errors import InputError
@@ -71,12 +72,14 @@ class LiveContext:
         self.health = HealthBook()
         self.inbox = Inbox()
         self.bus = Bus(session, config.uav, self.health, self.inbox)
-        self.clock: Clock = clock or WallClock()
-        self.wall = WallClock()
+        self.wall = WallClock(config.clock_ahead_s)
+        self.clock: Clock = clock or self.wall
         self.topics_in: list[Topic] = []
         self.at_stop: list[Callable[[], None]] = []
         self._timers: list[_Timer] = []
         self._wall_timers: list[_Timer] = []
+        self._stepped_ns = 0
+        """By how much the wall clock stepped since the timers were set."""
         self._throttle = Throttle()
 
     def on(
@@ -144,6 +147,8 @@ class LiveContext:
 
     def turn(self) -> None:
         """Fire what is due, handle the item that waited longest, or wait for the next thing to do."""
+        if self._stepped_ns:
+            self._move_timers()
         fired = self._fire(self._wall_timers, self.wall) + self._fire(self._timers, self.clock)
         taken = self.inbox.take()
         if taken is not None:
@@ -170,6 +175,16 @@ class LiveContext:
         if self._timers and not self.clock.simulated:
             waits.append((self._timers[0].due_ns - self.clock.now_ns()) * 1e-9)
         return max(0.0, min(waits))
+
+    def wall_stepped(self, by_ns: int) -> None:
+        """Take note, from any thread, that the wall clock was corrected in one step: what was due in 50 ms still is."""
+        self._stepped_ns += by_ns
+        self.inbox.wake()
+
+    def _move_timers(self) -> None:
+        by_ns, self._stepped_ns = self._stepped_ns, 0
+        for timer in (*self._wall_timers, *(() if self.clock.simulated else self._timers)):
+            timer.due_ns += by_ns
 
     def follow_simulated_clock(self) -> None:
         """Let ``sim/clock`` set the clock, on Zenoh's thread: time also moves while a handler works."""
@@ -243,7 +258,7 @@ def run_service(
     open_session = session or (lambda s: opened_node(config, name, lambda: s.is_set))
     try:
         with open_session(stop) as opened:
-            clock: Clock = SimulatedClock() if config.clock == "sim" else WallClock()
+            clock = SimulatedClock() if config.clock == "sim" else None
             return _serve(LiveContext(name, config, opened, clock), build, stop)
     except InputError:
         if stop.is_set:  # it was only waiting for the router
@@ -258,12 +273,17 @@ def _serve(context: LiveContext, build: Build, stop: StopSignal) -> int:
     def report(state: State | None = None) -> None:
         waiting = overdue.update() if overdue else ""
         context.bus.count_overflows()
+        tell(context.wall, context.health)
         health = reporter.report(context.wall.now_ns(), context.bus.passed, state, waiting)
         context.publish(HEALTH, health, context.service)
         if overdue is not None:
             # only once ready: the first kick arms the watchdog, and kernels may take longer to load than it waits
             sd_notify.notify("WATCHDOG=1")
 
+    if context.service != "router":
+        sync = ClockSync(context.service, context.wall, context.bus, context.wall_stepped)
+        sync.begin()
+        sync.keep(lambda: stop.is_set)
     report("starting")
     context.follow_simulated_clock()
     build(context)

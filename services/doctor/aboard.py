@@ -68,6 +68,12 @@ def clocks(services: Sequence[ServiceFact]) -> list[Finding]:
     """Return whose clock is not this machine's."""
     found = []
     for service in services:
+        ahead = service.clock_ahead_s
+        if ahead is not None and abs(ahead) > CLOCK_WARN_S:
+            words = (
+                f"{service.name}'s machine is {1e3 * ahead:+.0f} ms off the router's: its stamps are corrected for it"
+            )
+            found.append(Finding("clock", "warn", words, "synchronise both machines with chrony"))
         offset = service.clock_offset_s
         if offset is None or abs(offset) <= CLOCK_WARN_S:
             continue

@@ -116,10 +116,18 @@ def _services(heard: _Heard) -> list[ServiceFact]:
     return found
 
 
+def _ahead_s(health: Health) -> float | None:
+    """Return by how much a service's machine is ahead of the router's, as it tells; None: it does not (an older one)."""
+    if "clock_ahead_us" not in health.counters:
+        return None
+    return 1e-6 * (health.counters["clock_ahead_us"] - health.counters.get("clock_behind_us", 0))
+
+
 def _service(health: Health, heard_s: float) -> ServiceFact:
     return ServiceFact(
         health.service, health.state, health.pid, health.note, time.monotonic() - heard_s, health.rates_hz,
         _locked_bytes(health), 1e-9 * health.stamp_ns - (time.time() - (time.monotonic() - heard_s)), health.version,
+        _ahead_s(health),
     )  # fmt: skip
 
 

@@ -36,6 +36,8 @@ class ServiceFact:
     """Its stamps against this machine's clock; None: not told."""
     version: str = ""
     """Of the treedock that runs there; empty: it does not say."""
+    clock_ahead_s: float | None = None
+    """By how much its machine's clock is ahead of the router's, as it measured itself, and corrects; None: not told."""
 
 
 @dataclass(frozen=True, slots=True)

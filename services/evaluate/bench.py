@@ -29,6 +29,7 @@ BENCHES: dict[str, str] = {
     "system": "services.evaluate.bench_system",
     "station": "services.evaluate.bench_station",
     "faults": "services.evaluate.bench_faults",
+    "soak": "services.evaluate.bench_soak",
 }
 """Name of a benchmark -> module with ``run(options: BenchOptions) -> BenchReport``."""
 
@@ -47,6 +48,8 @@ class BenchOptions:
     """Names of scenes to do; empty: all."""
     count: int | None = None
     """How many runs, for benchmarks that fly or draw as many as wanted."""
+    minutes: float | None = None
+    """How long, for benchmarks that go on for as long as wanted (soak)."""
     rendered: bool = False
     """With rendered images and real processes, where a benchmark can do without (missions)."""
     quick: bool = False

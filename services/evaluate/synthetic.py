@@ -51,6 +51,8 @@ class ChainErrors(BaseModel):
     miss_share: float = 0.02
     list_s: float = 1.5
     """Delay from what was seen to the list of trees."""
+    listed_after_rad: float = float(np.pi)
+    """The list is empty before so much of the turn was flown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,7 +228,7 @@ class SyntheticChain:
         trees = []
         for i in range(len(self.trunks)):
             near = float(np.linalg.norm(self._trunk_map(i)[:2])) <= e.range_max_m
-            if near and self._turned_rad >= np.pi:
+            if near and self._turned_rad >= e.listed_after_rad:
                 trees.append(self._listed(i))
         return TreeList(
             stamp_ns=stamp_ns, map_id="synthetic", version=self._lists, graph_version=int(self.closed),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -152,6 +153,8 @@ class NavigatorConfig(BaseModel):
     safety_radius_m: float = Field(default=0.80, gt=0.0)
     live_guard: bool = True
     """Brake for whatever the depth image shows in the way, mapped or not, and fly only where somebody has looked."""
+    frames: Literal["raw", "compressed"] = "raw"
+    """Which of the camera's two keys the guard takes: ``compressed`` where the camera is on another machine."""
     guard_height_m: float = Field(default=0.25, gt=0.0)
     """Half height of the aircraft with margin, for the live guard."""
     preflight_wait_s: float = Field(default=30.0, gt=0.0)

@@ -7,14 +7,13 @@ import os
 from collections.abc import Callable
 from typing import get_args
 
-import numpy as np
-
 from schemas.camera import RgbdFrame
 from schemas.command import Command, CommandReply, NonceReply, NonceRequest
 from schemas.health import Health
 from schemas.orders import CommandName
 from schemas.slam import Pose
 from schemas.topics import (
+    CAMERA_COMPRESSED,
     CAMERA_RGBD,
     COMMAND,
     COMMAND_NONCE,
@@ -28,6 +27,7 @@ from schemas.topics import (
 )
 from schemas.trees import Target, TreeList
 from schemas.vehicle import VehicleState
+from services.camera.codecs import FrameError, decode_depth
 from services.common.context import Context
 from services.doctor.model import ServiceFact
 from services.navigator.commands import CommandDesk
@@ -68,7 +68,7 @@ class Navigator:
         c = self._context
         c.on(SLAM_POSE, self._on_pose)
         if self.mission.config.live_guard:
-            c.on(CAMERA_RGBD, self._on_frame)
+            c.on(CAMERA_COMPRESSED if self.mission.config.frames == "compressed" else CAMERA_RGBD, self._on_frame)
         c.on(TREES_LIST, self._on_trees)
         c.on(TREES_TARGET, self._on_target)
         c.on(VEHICLE_STATE, self._on_vehicle)
@@ -109,18 +109,23 @@ class Navigator:
         self._pose = Seen(pose, self._context.clock.now_ns())
 
     def _on_frame(self, frame: RgbdFrame) -> None:
-        """Look at the depth while there is a way to guard; frames of other encodings are not for us."""
+        """Look at the depth while there is a way to guard; a damaged frame counts as none."""
         track = self.mission.board.track
         here = track.latest
-        if self.mission.state in _UNGUARDED or here is None or frame.depth_encoding != "z16":
+        if self.mission.state in _UNGUARDED or here is None:
             return
-        size = (frame.intrinsics.height, frame.intrinsics.width)
+        i = frame.intrinsics
         with self._context.health.timed("guard"):
-            depth = np.frombuffer(frame.depth, dtype="<u2").reshape(size)
+            try:
+                depth = decode_depth(frame.depth, frame.depth_encoding, i.width, i.height)
+            except FrameError as error:
+                self._context.health.count("frames_refused")
+                LOG.warning("the guard refused a frame: %s", error)
+                return
             young = not track.lost and abs(frame.stamp_ns - here.stamp_ns) <= _CARRY_NS
             T = track.predict(frame.stamp_ns) if young else here.T_map_camera
             key = (here.map_id, here.reset_counter) if young else None
-            view = look(depth, frame.intrinsics, T, frame.stamp_ns, key)
+            view = look(depth, i, T, frame.stamp_ns, key)
         self._view = Seen(view, self._context.clock.now_ns())
 
     def _on_trees(self, trees: TreeList) -> None:

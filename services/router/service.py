@@ -9,9 +9,10 @@ import zenoh
 
 from services.common.config import TreedockConfig
 from services.common.errors import InputError
-from services.common.runtime import run_service
+from services.common.runtime import LiveContext, run_service
 from services.common.session import memory_settings, opened, port_is_free, router_config, split_endpoint
 from services.common.stop import StopSignal
+from services.router.keeper import TimeKeeper
 from services.router.watch import RegisterWatch
 from services.security.transport import router_settings
 
@@ -49,4 +50,9 @@ def run(config: TreedockConfig, stop: StopSignal | None = None) -> int:
         stop = StopSignal()
         stop.install()
     watch = RegisterWatch(config.security, stop.set)
-    return run_service("router", watch.register, config, stop, session=lambda _: listening(config))
+
+    def build(context: LiveContext) -> None:
+        watch.register(context)
+        TimeKeeper(context, context.wall, context.wall_stepped)
+
+    return run_service("router", build, config, stop, session=lambda _: listening(config))

@@ -54,7 +54,8 @@ def rights_of(identity: Identity, topics: Sequence[Topic] = TOPICS) -> Rights:
     return Rights(
         publish=tuple(_own_key(t, uav, role) for t in spoken),
         subscribe=tuple(t.key(uav) for t in heard),
-        ask=tuple(t.key(uav) for t in orders if t.producer == role) + tuple(t.key(uav) for t in heard if _kept(t)),
+        ask=tuple(t.key(uav) for t in orders if t.producer in {role, ANY})
+        + tuple(t.key(uav) for t in heard if _kept(t)),
         answer=tuple(t.key(uav) for t in orders if role in t.consumers) + tuple(t.key(uav) for t in spoken if _kept(t)),
         live=(f"{PREFIX}/{uav}/{LIVE.removesuffix('*')}{role}",) if role not in {READER} else (),
         watch=(f"{PREFIX}/{uav}/{LIVE}",),

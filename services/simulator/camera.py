@@ -12,12 +12,17 @@ from services.simulator.world import World
 
 
 class SimulatedCamera:
-    """An RGB-D camera in a world; always gives full-size images."""
+    """An RGB-D camera in a world; gives full-size images, or ``small`` ones of half that in which only depth is of use."""
 
-    def __init__(self, world: World, config: SensorConfig, reduced: bool = False, seed: int = 0) -> None:
-        self.intrinsics: Intrinsics = CAMERA_MODELS[config.model].intrinsics
-        self.render_scale = 0.5 if reduced else 1.0
-        rendered = halved(self.intrinsics) if reduced else self.intrinsics
+    def __init__(
+        self, world: World, config: SensorConfig, reduced: bool = False, seed: int = 0, small: bool = False
+    ) -> None:
+        full: Intrinsics = CAMERA_MODELS[config.model].intrinsics
+        self.intrinsics: Intrinsics = halved(full) if small else full
+        rendered = self.intrinsics
+        for _ in range(2 if small else int(reduced)):
+            rendered = halved(rendered)
+        self.render_scale = rendered.width / self.intrinsics.width
         self._renderer = Renderer(world, rendered)
         self._sensor = RgbdSensor(config, (rendered.height, rendered.width), self.render_scale, seed, rendered)
 

@@ -85,6 +85,8 @@ class FlightConfig(BaseModel):
     """Share of the camera's frames that never arrive, drawn from the simulator's seed."""
     limit_s: float = Field(default=600.0, gt=0.0)
     """Simulated time after which the flight is broken off."""
+    again: bool = False
+    """The aircraft may start once more after a landing: a landing does not end the simulation."""
 
 
 class ExternalConfig(BaseModel):
@@ -114,6 +116,9 @@ class SimulatorConfig(BaseModel):
     clock_rate_hz: float = Field(default=100.0, gt=0.0, le=1000.0)
     reduced: bool = False
     """Render 320x240 and scale up: for slow machines."""
+    small: bool = False
+    """Give 320x240 images, rendered at 80x60: for tests in which somebody stands in for slam and refiner. The live guard still
+    sees what is there; let ``sensor.disparity_sigma_px`` be 0, or the edges are as wide as the trunks."""
     mode: Literal["flight", "scan", "external"] = "flight"
     """flight: on the simulated aircraft; scan: on the scripted path; external: on the aircraft of another simulator."""
     flight: FlightConfig = FlightConfig()

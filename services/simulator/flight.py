@@ -158,7 +158,8 @@ class Flight:
             T_world_camera = self.camera.advance(1.0 / self._config.clock_rate_hz)
             self._feel(T_world_camera)
         self._credit_s -= self.px4.elapsed_s - before_s
-        if self.camera.done or self.px4.elapsed_s > self._config.flight.limit_s:
+        over = self.camera.done and not self._config.flight.again
+        if over or self.px4.elapsed_s > self._config.flight.limit_s:
             self.phase = "done"
         self._publish_clock()
 

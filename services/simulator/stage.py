@@ -31,7 +31,7 @@ class Stage:
         self.path = reference_path(scene, config.path, self.world.clearance)
         """The scripted path; also flown aircraft are judged by what could be seen from it."""
         self.touches = Touches(config.body_radius_m)
-        self._camera = SimulatedCamera(self.world, config.sensor, config.reduced, config.seed)
+        self._camera = SimulatedCamera(self.world, config.sensor, config.reduced, config.seed, config.small)
         self._accelerometer = Accelerometer(config.sensor, config.seed)
         self._T_map_world = np.eye(4)
         self._fair = fair_trees(self.world, self.path)

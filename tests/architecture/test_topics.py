@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import Path
 
 import pytest
 
-from schemas.topics import TOPICS, Delivery, Reach, find
+from schemas import topics
+from schemas.topics import TOPICS, Delivery, Reach, Topic, find
 from services.evaluate.architecture import render_table, spliced
 
 ROOT = Path(__file__).parents[2]
@@ -23,7 +25,7 @@ def test_keys_are_unique_and_plain() -> None:
 
 def test_every_consumer_and_producer_is_a_process_of_the_design() -> None:
     known = {"camera", "slam", "mapper", "detector", "refiner", "navigator", "autopilot", "simulator", "station",
-             "recorder", "preview", "evaluate", "*"}  # fmt: skip
+             "recorder", "preview", "evaluate", "router", "*"}  # fmt: skip
     for topic in TOPICS:
         assert {topic.producer, *topic.consumers} <= known
         assert topic.producer not in topic.consumers
@@ -57,3 +59,29 @@ def test_find_matches_leaves_and_names_the_choices() -> None:
 def test_architecture_page_shows_the_table_as_it_is() -> None:
     page = (ROOT / "ARCHITECTURE.md").read_text()
     assert page == spliced(page, render_table()), "run: python -m services.evaluate.architecture"
+
+
+_ROLES = {
+    "camera": "camera", "slam": "slam", "mapper": "mapper", "detector": "detector", "detector/refine": "refiner", "router": "router",
+    "navigator": "navigator", "navigator/autopilot": "autopilot", "preview": "preview", "simulator": "simulator",
+}  # fmt: skip
+
+
+def _heard(path: Path) -> set[str]:
+    """Return the names of the topics that a service's file subscribes to: first arguments of ``.on(...)``."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "on" and node.args:
+            found |= {n.id for n in ast.walk(node.args[0]) if isinstance(n, ast.Name)}
+    return found
+
+
+@pytest.mark.parametrize("folder", sorted(_ROLES))
+def test_every_service_is_a_consumer_of_what_it_listens_to(folder: str) -> None:
+    """Access control grants what the table says: a topic that is listened to without it is denied on an encrypted bus."""
+    role = _ROLES[folder]
+    for path in (ROOT / "services" / folder).glob("*.py"):
+        for name in _heard(path):
+            topic = getattr(topics, name, None)
+            if isinstance(topic, Topic):
+                assert role in topic.consumers or "*" in topic.consumers, f"{role} listens to {topic.name}"

@@ -150,3 +150,59 @@ def test_the_source_begins_when_all_others_are_ready_but_comes_back_at_once() ->
     bench.after(0.1)
     bench.after(5.0)
     assert sorted(bench.order[3:]) == ["camera", "slam"]
+
+
+def silent_router(bench: Bench) -> FakeProcess:
+    """All were ready; then the router hangs, and with it everybody's health; the others were heard a little earlier."""
+    bench.after(0.0)
+    for name in ("slam", "mapper"):
+        bench.ready(name)
+    bench.after(0.9)
+    bench.ready("router")
+    return bench.spawned[0]
+
+
+def test_a_hung_router_is_not_taken_for_the_hanging_of_all() -> None:
+    bench = Bench("router", "slam", "mapper")
+    router = silent_router(bench)
+    for _ in range(70):
+        bench.after(0.1)
+    assert router.signals == [signal.SIGKILL]
+    assert [p.signals for p in bench.spawned[1:3]] == [[], []]
+    bench.ready("router")
+    for _ in range(45):
+        bench.after(0.1)
+    assert [p.signals for p in bench.spawned[1:3]] == [[], []], "they had no time to be heard again"
+    for _ in range(10):
+        bench.ready("router")
+        bench.after(0.1)
+    assert [p.signals for p in bench.spawned[1:3]] == [[signal.SIGKILL]] * 2, "now they hang themselves"
+
+
+def test_a_configuration_damaged_in_flight_does_not_end_the_flight() -> None:
+    bench = Bench("router", "navigator")
+    bench.after(0.0)
+    bench.ready("navigator")
+    bench.spawned[1].code = -9
+    bench.after(0.1)
+    bench.after(0.6)
+    bench.spawned[2].code = 2
+    bench.after(0.1)
+    assert bench.supervisor.given_up is None
+    for _ in range(300):
+        if bench.spawned[-1].code is None:
+            bench.spawned[-1].code = 2
+        bench.after(0.1)
+    assert bench.supervisor.given_up is bench.supervisor.children["navigator"], "by then the aircraft has landed"
+
+
+def test_no_flight_ends_because_the_recorder_cannot_be_had_back() -> None:
+    bench = Bench("router", "recorder")
+    bench.after(0.0)
+    bench.ready("recorder")
+    for _ in range(600):
+        if len(bench.spawned) > 1 and bench.spawned[-1].code is None:
+            bench.spawned[-1].code = 2
+        bench.after(0.1)
+    assert bench.supervisor.given_up is None
+    assert len(bench.spawned) > LIMITS.give_up_after, "it is tried again and again"

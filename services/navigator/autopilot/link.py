@@ -1,4 +1,4 @@
-"""The wire to the autopilot: UDP, TCP or serial; a reading thread that answers TIMESYNC at once.
+"""MAVLink on a wire; a reading thread that answers TIMESYNC at once.
 
 ``Link`` is what the service needs of it, so that a simulated autopilot in the same process can take its place.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import socket
 import threading
 import time
 from collections import deque
@@ -19,15 +18,14 @@ from pymavlink.dialects.v20 import common as mav
 
 from services.common.errors import InputError
 from services.navigator.autopilot.bridge import timesync_answer
+from services.navigator.autopilot.wire import WAIT_S, Wire
 
 LOG = logging.getLogger(__name__)
 
-_WAIT_S = 0.2
 _AGAIN_S = 0.5
 _MAX_QUEUE = 4_000
 _SIGNING_EPOCH_S = 1_420_070_400
 """1 January 2015, where MAVLink's signing time begins."""
-_FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
 
 
 class Link(Protocol):
@@ -44,117 +42,6 @@ class Link(Protocol):
     def identify(self, system: int) -> None:
         """Speak as a component of this system from now on."""
         ...
-
-
-class Wire(Protocol):
-    """Bytes out and in; ``read`` waits a short while and may return nothing."""
-
-    def read(self) -> bytes: ...  # noqa: D102
-    def write(self, data: bytes) -> None: ...  # noqa: D102
-    def close(self) -> None: ...  # noqa: D102
-
-
-class UdpWire:
-    """A datagram socket that listens and answers who spoke last, or speaks to a fixed address."""
-
-    def __init__(self, host: str, port: int, *, listen: bool) -> None:
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.settimeout(_WAIT_S)
-        self._peer: tuple[str, int] | None = None if listen else (host, port)
-        if listen:
-            try:
-                self._socket.bind((host, port))
-            except (OSError, OverflowError):
-                self._socket.close()
-                raise
-
-    def read(self) -> bytes:
-        """Return the next datagram, empty after a short wait."""
-        try:
-            data, sender = self._socket.recvfrom(65535)
-        except (TimeoutError, ConnectionRefusedError):
-            return b""
-        self._peer = sender
-        return data
-
-    def write(self, data: bytes) -> None:
-        """Send a datagram to the peer, if there is one."""
-        if self._peer is not None:
-            self._socket.sendto(data, self._peer)
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
-
-
-class TcpWire:
-    """A TCP client; a lost connection raises OSError."""
-
-    def __init__(self, host: str, port: int) -> None:
-        self._socket = socket.create_connection((host, port), timeout=5.0)
-        self._socket.settimeout(_WAIT_S)
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-
-    def read(self) -> bytes:
-        """Return what came, empty after a short wait."""
-        try:
-            data = self._socket.recv(65535)
-        except TimeoutError:
-            return b""
-        if not data:
-            raise ConnectionResetError("the autopilot closed the connection")
-        return data
-
-    def write(self, data: bytes) -> None:
-        """Send all of it."""
-        self._socket.sendall(data)
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
-
-
-class SerialWire:
-    """A serial port, through pyserial."""
-
-    def __init__(self, device: str, baud: int) -> None:
-        try:
-            import serial  # type: ignore[import-untyped, unused-ignore]
-        except ImportError as error:
-            raise InputError(f"serial:{device}: the package pyserial is missing: pip install pyserial") from error
-        self._port = serial.Serial(device, baud, timeout=_WAIT_S, write_timeout=_WAIT_S)
-
-    def read(self) -> bytes:
-        """Return what came, empty after a short wait."""
-        return bytes(self._port.read(max(1, self._port.in_waiting)))
-
-    def write(self, data: bytes) -> None:
-        """Send all of it."""
-        self._port.write(data)
-
-    def close(self) -> None:
-        """Close the port."""
-        self._port.close()
-
-
-def open_wire(connection: str) -> Wire:
-    """Open the wire that ``connection`` names.
-
-    Raises:
-        InputError: a form that is not known, an address in use, a device that is not there.
-    """
-    kind, _, rest = connection.partition(":")
-    place, _, number = rest.rpartition(":")
-    if kind not in ("udpin", "udpout", "tcp", "serial") or not place or not number.isdigit():
-        raise InputError(f"autopilot.connection {connection!r}: expected {_FORMS}")
-    try:
-        if kind == "serial":
-            return SerialWire(place, int(number))
-        if kind == "tcp":
-            return TcpWire(place, int(number))
-        return UdpWire(place, int(number), listen=kind == "udpin")
-    except (OSError, OverflowError) as error:
-        raise InputError(f"autopilot.connection {connection!r}: {error}") from error
 
 
 def read_secret(path: str) -> bytes | None:
@@ -239,6 +126,11 @@ class MavlinkLink:
         self._thread = threading.Thread(target=self._read, name="mavlink", daemon=True)
         self._thread.start()
 
+    @property
+    def bad(self) -> int:
+        """What was no MAVLink, and datagrams of others than the autopilot."""
+        return self.codec.bad_bytes + getattr(self._wire, "strays", 0)
+
     def poll(self) -> list[tuple[Any, int]]:
         """Return what came since the last call."""
         out = []
@@ -257,7 +149,7 @@ class MavlinkLink:
     def close(self) -> None:
         """Stop the thread and close the wire."""
         self._stopped.set()
-        self._thread.join(2.0 * _WAIT_S)
+        self._thread.join(2.0 * WAIT_S)
         self._wire.close()
 
     def _write(self, data: bytes) -> None:

@@ -11,8 +11,9 @@ from schemas.topics import MISSION_GUIDANCE, SLAM_POSE, VEHICLE_STATE
 from services.common.context import Context
 from services.navigator.autopilot.bridge import Bridge
 from services.navigator.autopilot.config import AutopilotConfig
-from services.navigator.autopilot.link import Codec, Link, MavlinkLink, open_wire, read_secret
+from services.navigator.autopilot.link import Codec, Link, MavlinkLink, read_secret
 from services.navigator.autopilot.parameters import differences, table
+from services.navigator.autopilot.wire import open_wire
 
 LOG = logging.getLogger(__name__)
 
@@ -78,6 +79,7 @@ class Autopilot:
         book.note("controls", bridge.foreign.word(now_ns))
         book.note("link", "" if state.connected else "no word from the autopilot: is it running, is the address right?")
         book.note("wire", getattr(self._link, "failed", ""))
+        book.counters["mavlink_bad"] = getattr(self._link, "bad", 0)
 
     def _tell_parameters(self) -> None:
         """Say once how the vehicle's parameters stand, and each time that some were set."""

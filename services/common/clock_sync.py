@@ -1,0 +1,103 @@
+"""Keeps a live service's wall clock at the router's: asked at the start, before anything is stamped, and every two seconds."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import zenoh
+
+from schemas.codec import Wire
+from schemas.timekeeping import ClockReply, ClockRequest
+from schemas.topics import CLOCK, Topic
+from services.common.clock import WallClock
+from services.common.context import HealthBook
+from services.common.timekeeping import OffsetFilter
+
+LOG = logging.getLogger(__name__)
+
+FAR_NS = 20_000_000
+"""Clocks farther apart than this are told in health; PX4 drops vision whose clock is 10 ms off for long."""
+_FIRST, _TIMEOUT_S = 5, 0.3
+_PERIOD_S = 2.0
+_YOUNG_S = 5.0
+"""So soon after its start a service may still step: nobody rests on its stamps yet."""
+
+
+class Asker(Protocol):
+    """The bus, as far as it is needed here."""
+
+    def ask(
+        self, topic: Topic, request: Wire | None, kind: type[ClockReply], timeout_s: float, leaf: str | None = None
+    ) -> Sequence[ClockReply]:
+        """Query a key."""
+        ...
+
+
+class ClockSync:
+    """Measures and corrects. ``stepped(by_ns)`` is called when the time jumps; in the sync's thread after the start."""
+
+    def __init__(
+        self, service: str, wall: WallClock, asker: Asker, stepped: Callable[[int], None],
+        monotonic_s: Callable[[], float] = time.monotonic,
+    ) -> None:  # fmt: skip
+        self._request = ClockRequest(sender=service)
+        self._wall, self._asker, self._stepped, self._monotonic_s = wall, asker, stepped, monotonic_s
+        self._filter = OffsetFilter()
+        self._begun_s = monotonic_s()
+        self._measured = False
+
+    def begin(self) -> None:
+        """Measure and correct at once; a router that does not answer (an older one) leaves the clock as it is."""
+        for _ in range(_FIRST):
+            if not self._exchange():
+                return
+        self._correct()
+
+    def keep(self, stopped: Callable[[], bool]) -> None:
+        """Measure and correct from a thread of its own until ``stopped()``."""
+        threading.Thread(target=self._run, args=(stopped,), name="clock", daemon=True).start()
+
+    def _run(self, stopped: Callable[[], bool]) -> None:
+        while not stopped():
+            time.sleep(_PERIOD_S)
+            try:
+                if not stopped() and self._exchange():
+                    self._correct()
+            except zenoh.ZError as error:
+                if stopped():
+                    return  # the session closed under the question
+                LOG.warning("the router's clock could not be asked: %s", error)
+
+    def _exchange(self) -> bool:
+        """Ask once; return whether an answer came."""
+        asked_ns = self._wall.machine_ns()
+        replies = self._asker.ask(CLOCK, self._request, ClockReply, _TIMEOUT_S)
+        if not replies:
+            return False
+        self._filter.add(asked_ns, replies[0].stamp_ns, self._wall.machine_ns())
+        return True
+
+    def _correct(self) -> None:
+        offset_ns = self._filter.offset_ns
+        if offset_ns is None:
+            return
+        far = abs(offset_ns - self._wall.correction_ns) > FAR_NS
+        young = self._monotonic_s() - self._begun_s < _YOUNG_S
+        at_once = not self._measured or (far and young)
+        self._measured = True
+        step_ns = self._wall.correct(offset_ns, at_once=at_once)
+        if abs(step_ns) > FAR_NS:
+            LOG.warning("this machine's clock is %+.0f ms off the router's: corrected", -offset_ns * 1e-6)
+        if step_ns:
+            self._stepped(step_ns)
+
+
+def tell(wall: WallClock, book: HealthBook) -> None:
+    """Put the correction into health: microseconds by which the machine's clock is ahead of the router's, or behind."""
+    microseconds = wall.correction_ns // 1000
+    book.counters["clock_behind_us"] = max(0, microseconds)
+    book.counters["clock_ahead_us"] = max(0, -microseconds)

@@ -1,0 +1,185 @@
+"""Missions one after the other for an hour: memory, threads, files, shared memory, rates. ``treedock bench soak --minutes 60``.
+
+The samples lie in ``soak.jsonl``, one line for every ten seconds, written as they come: a run that was broken off is reported as
+far as it came (``--count 0`` is not needed: call again with fewer minutes). ``--scenes chain`` soaks the real camera, slam, mapper,
+detector and refiner over a recording instead of missions with stand-ins.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+from services.common.errors import InputError
+from services.evaluate.bench import BenchOptions, BenchReport, code_version
+from services.evaluate.faults.bench_rig import GROUND
+from services.evaluate.faults.flown import ENDED
+from services.evaluate.faults.missions import Flights
+from services.evaluate.faults.rig import ONBOARD, Rig
+from services.evaluate.faults.system import flight_config
+from services.evaluate.soak_figures import Sample, faults_of, of_service, steady
+
+_MINUTES, _QUICK_MINUTES = 60.0, 3.0
+_EVERY_S = 10.0
+_SPEED = 1.0
+_SEED = 9100
+_CODE = ("services.common", "services.navigator", "services.router", "services.recorder", "services.evaluate.faults")
+
+
+def run(options: BenchOptions) -> BenchReport:
+    """Fly for so long, unless a run of this code that long is there; report."""
+    minutes = options.minutes or (_QUICK_MINUTES if options.quick else _MINUTES)
+    kind = "chain" if "chain" in options.scenes else "flight"
+    path = options.out / f"soak-{kind}.jsonl"
+    version = code_version(_CODE)
+    rows = _read(path, version)
+    if not rows or rows[-1]["at_s"] < 60.0 * minutes - 2 * _EVERY_S:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("w", encoding="utf-8") as stream:
+
+            def write(row: dict[str, Any]) -> None:
+                stream.write(json.dumps({"code": version, **row}) + "\n")
+                stream.flush()
+                options.tell(f"{row['at_s'] / 60:.1f} min: {row['missions']} missions, {row['rss_mb']:.0f} MB")
+
+            seed = _SEED if options.seed is None else options.seed
+            with tempfile.TemporaryDirectory(prefix="treedock-soak-") as folder:
+                (_soak_chain if kind == "chain" else _soak_flights)(
+                    Path(folder), seed, 60.0 * minutes, write, options.tell
+                )
+        rows = _read(path, version)
+    return report_of(rows, kind, version)
+
+
+def _read(path: Path, version: str) -> list[dict[str, Any]]:
+    """Return the samples of a run of this code; a torn last line is left out."""
+    rows = []
+    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
+        try:
+            row = json.loads(line)
+        except ValueError:
+            break
+        if row["code"] != version:
+            return []
+        rows.append(row)
+    return rows
+
+
+Write = Callable[[dict[str, Any]], None]
+
+
+def _soak_flights(folder: Path, seed: int, for_s: float, write: Write, tell: Callable[[str], None]) -> None:
+    config = flight_config(seed, folder, speed=_SPEED)
+    # the disk holds an hour, but no more
+    config = config.model_copy(update={"recorder": config.recorder.model_copy(update={"frames": "off", "file_mb": 50})})
+    with Rig(config, folder, (*ONBOARD, *GROUND, "simulator")) as rig:
+        flights = Flights(rig, np.random.default_rng(seed), tell)
+        flights.begin()
+        sampler = _Sampler(rig, write)
+        while sampler.age_s < for_s:
+            rig.pump(0.2)
+            sampler.turn(flights.starts, rig.flown.docks)
+            if rig.flown.state in ENDED and not rig.flown.armed:
+                flights.begin()
+
+
+def _soak_chain(folder: Path, seed: int, for_s: float, write: Write, tell: Callable[[str], None]) -> None:
+    from services.evaluate.faults.chain import Chain
+
+    with Chain.over_a_recording(seed, folder, tell) as chain:
+        sampler = _Sampler(chain.rig, write)
+        while sampler.age_s < for_s:
+            chain.rig.pump(0.2)
+            sampler.turn(0, 0)
+
+
+class _Sampler:
+    """Writes a row every ten seconds."""
+
+    def __init__(self, rig: Rig, write: Write) -> None:
+        self._rig, self._write = rig, write
+        self._begin_s = self._last_s = time.monotonic()
+        self._poses, self._sim_ns = rig.flown.poses, rig.flown.now_ns
+
+    @property
+    def age_s(self) -> float:
+        return time.monotonic() - self._begin_s
+
+    def turn(self, missions: int, docks: int) -> None:
+        """Write a row when one is due."""
+        now_s = time.monotonic()
+        if now_s - self._last_s < _EVERY_S:
+            return
+        flown = self._rig.flown
+        # by simulated time where there is one: a busy machine is slower without anything being wrong
+        passed_s = (flown.now_ns - self._sim_ns) * 1e-9 if flown.now_ns else now_s - self._last_s
+        rate = (flown.poses - self._poses) / passed_s if passed_s > 0 else 0.0
+        self._last_s, self._poses, self._sim_ns = now_s, flown.poses, flown.now_ns
+        services = [sample for name in self._rig.services if (sample := self._sample(name)) is not None]
+        self._write({
+            "at_s": round(self.age_s, 1), "sim_s": round(flown.now_ns * 1e-9, 1), "missions": missions, "docks": docks,
+            "touches": flown.touches, "pose_hz": round(rate, 2), "rss_mb": sum(s["rss_mb"] for s in services),
+            "shm_files": len(list(Path("/dev/shm").iterdir())), "own_shm_mb": round(sum(s["shm_mb"] for s in services), 1),
+            "services": services,
+        })  # fmt: skip
+
+    def _sample(self, name: str) -> dict[str, Any] | None:
+        try:
+            process = psutil.Process(self._rig.pid(name))
+            memory = process.memory_info()
+            return {
+                "service": name, "pid": process.pid, "rss_mb": round(memory.rss / 2**20, 2), "shm_mb": round(memory.shared / 2**20, 2),
+                "threads": process.num_threads(), "files": process.num_fds(),
+            }  # fmt: skip
+        except (psutil.Error, InputError):
+            return None  # between two lives
+
+
+def report_of(rows: Sequence[Mapping[str, Any]], kind: str, version: str) -> BenchReport:
+    """Return figures and table of a run.
+
+    Raises:
+        InputError: nothing was sampled.
+    """
+    if not rows:
+        raise InputError("no sample yet: --minutes is too short")
+    names = list(dict.fromkeys(s["service"] for row in rows for s in row["services"]))
+    lines = ["| service | memory (MB) | slope (MB/h) | +- | threads | more | files | more | restarts | grows |",
+             "|---|---|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    grows, total = [], 0.0
+    for name in names:
+        samples = [
+            Sample(row["at_s"], name, s["pid"], s["rss_mb"], s["threads"], s["files"])
+            for row in rows for s in row["services"] if s["service"] == name
+        ]  # fmt: skip
+        f = of_service(samples)
+        words = faults_of(f)
+        grows += [f"{name}: {word}" for word in words]
+        total += f["mb_per_h"]
+        lines.append(
+            f"| {name} | {f['rss_mb']:.0f} | {f['mb_per_h']:+.2f} | {f['mb_per_h_error']:.2f} | {f['threads']:.0f} | {f['threads_more']:+.0f} "
+            f"| {f['files']:.0f} | {f['files_more']:+.0f} | {f['restarts']:.0f} | {'; '.join(words)} |"
+        )
+    last, quarter = rows[-1], rows[len(rows) // 4]
+    figures = {
+        "minutes": round(last["at_s"] / 60.0, 1), "simulated_minutes": round(last["sim_s"] / 60.0, 1), "missions": last["missions"],
+        "docks": last["docks"], "touches": last["touches"], "mb": round(last["rss_mb"], 0), "mb_per_h": round(total, 2),
+        "grows": len(grows), "shm_files_more": last["shm_files"] - quarter["shm_files"],
+        "pose_hz": round(sum(r["pose_hz"] for r in rows) / len(rows), 2), "pose_hz_spread": round(steady([r["pose_hz"] for r in rows]), 3),
+    }  # fmt: skip
+    conditions = {
+        "what": "missions one after the other, stand-ins for slam, mapper, detector, refiner" if kind == "flight"
+        else "the real camera, slam, mapper, detector, refiner over a recording that goes on and on",
+        "slopes": "least squares over the last three quarters, by means of twelfths; 'grows' beyond 1 %/h and 3 standard errors",
+        "rates": "poses per second of simulated time (flight), of the wall (chain)",
+        "load at the end": f"{os.getloadavg()[0]:.1f}", "code": version,
+    }  # fmt: skip
+    return BenchReport(figures=figures, conditions=conditions, table="\n".join(lines))

@@ -1,0 +1,93 @@
+"""What must hold after a fault, asked of what was measured. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from services.evaluate.faults.flown import ENDED
+from services.evaluate.faults.missions import Seen
+
+HOLD_S = 0.5
+_MOMENT_S = 0.15
+"""What is uncertain of the fault's moment in simulated time: how far the clock was ahead of what had been heard."""
+PX4_LEAVES_S = 1.4
+"""PX4 leaves offboard so long after the last setpoint (measured on PX4 v1.16), and lands."""
+SILENT_S = 3.5 + 1.0
+"""Health is missed after 3.5 s, and is sent once a second."""
+_MOVING = frozenset({"take_off", "scan", "select", "face", "approach", "dock", "docked", "undock", "return"})
+_SIGHTED = frozenset({"approach", "dock"})
+_MAPPING = frozenset({"scan", "select", "face"})
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Seconds of the wall that a machine is given; a loaded one may be given more."""
+
+    back_s: float = 3.5
+    noticed_s: float = 11.5
+    """A hung service: ``supervisor.hung_after_s`` and one period of its health."""
+
+
+def faults_of(service: str, seen: Seen, limits: Limits) -> Iterator[str]:
+    """Yield in words what did not hold after ``service`` was harmed; nothing when all did."""
+    yield from _flight(service, seen)
+    yield from common(seen)
+    if seen.noticed_s is None or seen.noticed_s > limits.noticed_s:
+        yield f"its hanging was noticed after {seen.noticed_s} s, not within {limits.noticed_s}"
+    if seen.ready_s is None or seen.ready_s > limits.back_s:
+        yield f"ready after {seen.ready_s} s, not within {limits.back_s}"
+
+
+def common(seen: Seen) -> Iterator[str]:
+    """Yield what must hold after any fault."""
+    if seen.touches:
+        yield f"{seen.touches} touches"
+    if seen.armings > seen.starts:
+        yield f"armed {seen.armings} times for {seen.starts} start commands"
+    if not seen.replays_refused:
+        yield "a start command was carried out a second time"
+    if seen.trees_lost:
+        yield f"{seen.trees_lost} trees lost"
+    if seen.end in ENDED and not seen.reason:
+        yield f"the mission ended ({seen.end}) without a reason"
+    if seen.end in ENDED and seen.armed_after:
+        yield f"the mission ended ({seen.end}) with the aircraft armed"
+    if seen.end not in ENDED and seen.end not in _MOVING | {"landing"}:
+        yield f"the mission neither went on nor ended: {seen.end or 'no word'}, {seen.reason}"
+
+
+def _flight(service: str, seen: Seen) -> Iterator[str]:
+    """Yield what the aircraft did too late, by the safety table."""
+    within_s = hold_within_s(service, seen.state)
+    if within_s is None:
+        return
+    if seen.held_s is None or seen.held_s > within_s + _MOMENT_S:
+        yield f"held after {seen.held_s} s in {seen.state}, not within {within_s} s"
+
+
+def hold_within_s(service: str, state: str) -> float | None:
+    """Return within how many seconds somebody must hold or land; None: the flight does not need that service then."""
+    if state not in _MOVING:
+        return None
+    if service in {"slam", "camera", "navigator"}:
+        return HOLD_S
+    if service == "autopilot":
+        return PX4_LEAVES_S
+    if service == "refiner" and state in _SIGHTED:
+        return HOLD_S
+    return None
+
+
+def summary(seen: Sequence[Seen]) -> dict[str, float | None]:
+    """Return the worst of several faults."""
+
+    def worst(values: list[float | None]) -> float | None:
+        known = [v for v in values if v is not None]
+        return round(max(known), 2) if known else None
+
+    return {
+        "held_s": worst([s.held_s for s in seen if s.state in _MOVING]), "rest_s": worst([s.rest_s for s in seen]),
+        "way_m": worst([s.way_m for s in seen]), "noticed_s": worst([s.noticed_s for s in seen]),
+        "back_s": worst([s.back_s for s in seen]), "ready_s": worst([s.ready_s for s in seen]),
+    }  # fmt: skip

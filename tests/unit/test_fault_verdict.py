@@ -1,0 +1,59 @@
+"""What is made of a fault's measurements: everything that must hold can fail."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from services.evaluate.faults.missions import Seen, line_of
+from services.evaluate.faults.verdict import Limits, common, faults_of, hold_within_s, summary
+
+GOOD = Seen(
+    what="kill -9 slam", state="approach", at_s=20.0, moved_m_s=0.3, noticed_s=0.0, back_s=2.0, ready_s=2.0, held_s=0.42, rest_s=1.0, way_m=0.3,
+    end="landed", reason="slam is dead or hung", words=("slam is dead or hung",), touches=0, armings=1, starts=1,
+    replays_refused=True, trees_lost=0, armed_after=False,
+)  # fmt: skip
+
+
+def test_what_holds_is_not_complained_of() -> None:
+    assert list(faults_of("slam", GOOD, Limits())) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"held_s": 0.9}, "held after 0.9"), ({"held_s": None}, "held after None"), ({"ready_s": 4.0}, "ready after 4.0"),
+        ({"ready_s": None}, "ready after None"), ({"noticed_s": 20.0}, "noticed after 20.0"), ({"touches": 1}, "1 touches"),
+        ({"armings": 2}, "armed 2 times"), ({"replays_refused": False}, "second time"), ({"trees_lost": 1}, "1 trees lost"),
+        ({"reason": ""}, "without a reason"), ({"armed_after": True}, "armed"), ({"end": "hold"}, "neither went on nor ended"),
+        ({"end": ""}, "no word"),
+    ],
+)  # fmt: skip
+def test_whatever_does_not_hold_is_named(change: dict[str, object], word: str) -> None:
+    found = list(faults_of("slam", replace(GOOD, **change), Limits()))  # type: ignore[arg-type]
+    assert len(found) == 1
+    assert word in found[0]
+
+
+def test_what_each_loss_asks_of_the_flight() -> None:
+    assert hold_within_s("slam", "scan") == hold_within_s("navigator", "dock") == 0.5
+    assert hold_within_s("refiner", "approach") == 0.5
+    assert hold_within_s("refiner", "scan") is None
+    assert hold_within_s("recorder", "approach") is None
+    assert hold_within_s("slam", "landing") is None
+    autopilot = hold_within_s("autopilot", "scan")
+    assert autopilot is not None
+    assert autopilot > 1.2
+
+
+def test_a_mission_that_flies_on_is_well() -> None:
+    assert list(common(replace(GOOD, end="approach", reason="on"))) == []
+    assert list(common(replace(GOOD, end="landing", armed_after=True))) == []
+
+
+def test_the_worst_of_several_counts() -> None:
+    several = [GOOD, replace(GOOD, held_s=0.5, back_s=None), replace(GOOD, state="landing", held_s=9.0)]
+    assert summary(several)["held_s"] == 0.5
+    assert summary(several)["back_s"] == 2.0
+    assert "never" in line_of(replace(GOOD, back_s=1e9))

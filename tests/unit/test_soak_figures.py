@@ -1,0 +1,51 @@
+"""Slopes and leaks of long runs, on made-up samples."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from services.evaluate.soak_figures import Sample, faults_of, of_service, slope, steady
+
+
+def samples(mb_per_h: float, files_per_h: float = 0.0, noise_mb: float = 0.3) -> list[Sample]:
+    rng = np.random.default_rng(5)
+    out = []
+    for at_s in np.arange(10.0, 3600.0, 10.0):
+        warm = 40.0 * (1.0 - np.exp(-at_s / 60.0))  # caches that fill in the first minutes
+        rss = 100.0 + warm + mb_per_h * at_s / 3600.0 + rng.normal(0.0, noise_mb)
+        out.append(Sample(float(at_s), "slam", 7, float(rss), 9, 20 + int(files_per_h * at_s / 3600.0)))
+    return out
+
+
+def test_a_flat_memory_is_called_flat_although_it_filled_at_first() -> None:
+    figures = of_service(samples(0.0))
+    assert abs(figures["mb_per_h"]) < 0.5
+    assert faults_of(figures) == []
+
+
+def test_a_leak_is_found_with_its_size() -> None:
+    figures = of_service(samples(12.0, files_per_h=8.0))
+    assert figures["mb_per_h"] == pytest.approx(12.0, abs=0.5)
+    assert [word.split(" ")[-1] for word in faults_of(figures)] == ["MB/h", "files"]
+
+
+def test_a_restart_is_told() -> None:
+    some = samples(0.0)
+    some[200:] = [Sample(s.at_s, s.service, 8, s.rss_mb, s.threads, s.files) for s in some[200:]]
+    assert "1 restarts" in faults_of(of_service(some))
+
+
+def test_a_slope_knows_its_error() -> None:
+    rng = np.random.default_rng(6)
+    t = np.arange(0.0, 3600.0, 10.0)
+    line = slope(list(t), list(50.0 + rng.normal(0.0, 1.0, len(t))))
+    assert not line.rises
+    assert 0.0 < line.error_per_hour < 2.0
+    assert slope([0.0, 1.0], [1.0, 2.0]).error_per_hour == float("inf")
+
+
+def test_the_spread_of_a_rate() -> None:
+    assert steady([15.0] * 60) == 0.0
+    assert steady([15.0] * 30 + [7.5] * 30) > 0.3
+    assert steady([]) == float("inf")

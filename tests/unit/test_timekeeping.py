@@ -1,0 +1,118 @@
+"""One time for all machines: offsets from four stamps, corrections that neither jump nor run back."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import pytest
+
+from schemas.health import Health
+from schemas.timekeeping import ClockReply
+from services.common.clock import WallClock, on_clock_ns
+from services.common.clock_sync import ClockSync, tell
+from services.common.config import TreedockConfig
+from services.common.context import HealthBook
+from services.common.memory import Hub, MemoryContext
+from services.common.timekeeping import OffsetFilter
+from services.router.keeper import TimeKeeper
+
+MS = 1_000_000
+OFF_NS = 200 * MS
+
+
+def test_the_quickest_exchange_counts() -> None:
+    offsets = OffsetFilter()
+    offsets.add(0, OFF_NS + 30 * MS, 40 * MS)  # 20 ms came late: its answer was 10 ms wrong
+    offsets.add(100 * MS, OFF_NS + 101 * MS, 102 * MS)
+    offsets.add(200 * MS, OFF_NS + 215 * MS, 260 * MS)
+    assert offsets.offset_ns == OFF_NS
+
+
+def test_less_than_the_measurements_own_error_is_no_offset() -> None:
+    assert OffsetFilter().offset_ns is None
+    offsets = OffsetFilter()
+    offsets.add(0, 2 * MS, 6 * MS)
+    assert offsets.offset_ns == 0
+    offsets.forget()
+    assert offsets.best is None
+
+
+class Router:
+    """Answers like the router, whose clock is ``ahead_ns`` ahead of this machine's."""
+
+    def __init__(self, ahead_ns: int) -> None:
+        self.clock, self.ahead_ns = WallClock(), ahead_ns
+        self.there = True
+
+    def ask(self, *_: object, **__: object) -> Sequence[ClockReply]:
+        return [ClockReply(stamp_ns=self.clock.machine_ns() + self.ahead_ns)] if self.there else []
+
+
+def test_a_service_starts_on_the_routers_time() -> None:
+    wall, stepped = WallClock(), list[int]()
+    router = Router(OFF_NS)
+    ClockSync("slam", wall, router, stepped.append).begin()
+    assert abs(wall.now_ns() - wall.machine_ns() - OFF_NS) < 5 * MS
+    assert len(stepped) == 1
+    book = HealthBook()
+    tell(wall, book)
+    assert abs(book.counters["clock_behind_us"] - 200_000) < 5_000
+    assert book.counters["clock_ahead_us"] == 0
+
+
+def test_without_an_answer_the_clock_is_left_alone() -> None:
+    wall, stepped = WallClock(), list[int]()
+    router = Router(OFF_NS)
+    router.there = False
+    ClockSync("slam", wall, router, stepped.append).begin()
+    assert wall.correction_ns == 0
+    assert stepped == []
+
+
+def test_a_later_offset_is_slewed_in_and_time_never_runs_back() -> None:
+    wall = WallClock()
+    wall.correct(-OFF_NS)
+    last_ns, begin_ns = wall.now_ns(), time.monotonic_ns()
+    for _ in range(200):
+        now_ns = wall.now_ns()
+        assert now_ns >= last_ns
+        last_ns = now_ns
+        time.sleep(1e-4)
+    passed_ns = time.monotonic_ns() - begin_ns
+    assert 0 < -wall.correction_ns <= passed_ns // 1000 + 1
+    assert wall.correct(MS, at_once=True) > MS
+
+
+def test_a_sensors_stamp_is_counted_by_the_services_clock() -> None:
+    wall = WallClock(ahead_s=3600.0)
+    off_ns = on_clock_ns(wall, time.time_ns()) - wall.now_ns()
+    assert abs(off_ns) < 100 * MS
+
+
+def health(stamp_ns: int, uptime_s: float, service: str = "slam") -> Health:
+    return Health(service=service, stamp_ns=stamp_ns, seq=0, state="ready", pid=1, uptime_s=uptime_s, counters={},
+                  rates_hz={}, work_ms={})  # fmt: skip
+
+
+@pytest.fixture
+def context() -> MemoryContext:
+    return Hub(TreedockConfig()).context("router")
+
+
+def test_a_router_started_again_takes_up_the_time_of_those_who_outlived_it(context: MemoryContext) -> None:
+    wall, stepped = WallClock(ahead_s=3600.0), list[int]()  # its machine's clock was set
+    keeper = TimeKeeper(context, wall, stepped.append)
+    theirs = WallClock()
+    keeper.on_health(health(theirs.now_ns() + 7 * 3600 * 10**9, 0.2, "camera"))  # started after it: knows nothing
+    keeper.on_health(health(theirs.now_ns(), 60.0))
+    assert abs(wall.now_ns() - theirs.now_ns()) < 50 * MS
+    keeper.on_health(health(theirs.now_ns() + 10**9, 60.0))  # one is enough
+    assert len(stepped) == 1
+
+
+def test_the_way_of_a_message_is_no_reason_to_set_the_clock(context: MemoryContext) -> None:
+    wall, stepped = WallClock(), list[int]()
+    TimeKeeper(context, wall, stepped.append).on_health(health(wall.now_ns() - 15 * MS, 60.0))
+    assert wall.correction_ns == 0
+    assert stepped == []
