@@ -10,7 +10,8 @@ import pytest
 from pymavlink.dialects.v20 import common as mav
 
 from services.common.errors import InputError
-from services.navigator.autopilot.link import Codec, MavlinkLink, open_wire
+from services.navigator.autopilot.link import Codec, MavlinkLink
+from services.navigator.autopilot.wire import open_wire
 
 
 def _free_port() -> int:
