@@ -9,7 +9,6 @@ from collections.abc import Callable
 from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 
-import numpy as np
 import psutil
 
 from schemas.health import Health
@@ -18,14 +17,22 @@ from services.common.bus import Bus
 from services.common.context import HealthBook
 from services.common.errors import GoalNotReachedError
 from services.common.session import opened_client
-from services.evaluate.bench import BenchOptions, BenchReport
-from services.evaluate.station_ground import Ground, Page
+from services.evaluate.bench import BenchOptions, BenchReport, code_version
+from services.evaluate.station_cuts import cuts, figures_of
+from services.evaluate.station_ground import Ground, Page, until
 from services.evaluate.station_load import Load
 
 _AIRCRAFT, _RATE_HZ, _TREES = 10, 5.0, 500
 _MEASURE_S, _QUICK_S = 20.0, 8.0
 _KILLS, _QUICK_KILLS = 100, 5
-_MOST_LOST_S = 1.0
+_CODE = (
+    "services.station",
+    "services.inventory",
+    "services.common",
+    "services.router",
+    "schemas",
+    "services.evaluate.bench_station",
+)
 
 
 def run(options: BenchOptions) -> BenchReport:
@@ -34,6 +41,8 @@ def run(options: BenchOptions) -> BenchReport:
     seconds = _QUICK_S if options.quick else _MEASURE_S
     kills = options.count or (_QUICK_KILLS if options.quick else _KILLS)
     figures: dict[str, float] = {"aircraft": _AIRCRAFT}
+    version = code_version(_CODE)
+    cut_rows = cuts(options, kills, version)
     with ExitStack() as stack:
         ground = Ground(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="treedock-bench-"))))
         stack.callback(ground.close)
@@ -43,37 +52,19 @@ def run(options: BenchOptions) -> BenchReport:
         figures |= _load(ground, load, seconds, options.tell)
         figures |= _restarts(ground, load, options.tell)
         load.go(on=False)
-    with ExitStack() as stack:
-        ground = Ground(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="treedock-bench-"))))
-        stack.callback(ground.close)
-        ground.start("router")
-        load = stack.enter_context(Load(ground.endpoint, 1, _RATE_HZ, 50, seed + 1))
-        figures |= _power_cuts(ground, load, kills, np.random.default_rng(seed), options.tell)
+    figures |= figures_of(cut_rows)
     conditions = {
         "load": f"{_AIRCRAFT} aircraft, each {_RATE_HZ:g} Hz of pose, mission, vehicle, target and a list of {_TREES} trees, "
         f"all of them moved by noise of 4 mm; {seconds:g} s; one page open",
-        "power cuts": f"{kills} times kill -9 of the station at a random moment, one aircraft with 50 trees",
+        "power cuts": f"{kills} times kill -9 of the station at a random moment, one aircraft with 50 trees; taken up where an earlier call stopped",
+        "code": version,
         "seed": str(seed),
     }  # fmt: skip
     return BenchReport(figures, conditions, _table(figures))
 
 
-def _until(condition: Callable[[], bool], timeout_s: float, pause_s: float = 0.05) -> float:
-    """Return the seconds until ``condition`` held.
-
-    Raises:
-        GoalNotReachedError: it did not in time.
-    """
-    begin_s = time.monotonic()
-    while not condition():
-        if time.monotonic() - begin_s > timeout_s:
-            raise GoalNotReachedError(f"bench station: not reached within {timeout_s:g} s")
-        time.sleep(pause_s)
-    return time.monotonic() - begin_s
-
-
 def _load(ground: Ground, load: Load, seconds: float, tell: Callable[[str], None]) -> dict[str, float]:
-    _until(ground.served, 30.0)
+    until(ground.served, 30.0)
     health: dict[str, Health] = {}
 
     def take(message: Health) -> None:
@@ -89,7 +80,7 @@ def _load(ground: Ground, load: Load, seconds: float, tell: Callable[[str], None
             return health["station"].counters.get("messages", 0) if "station" in health else -1
 
         load.go(on=True)
-        _until(lambda: counted() > 500, 30.0)
+        until(lambda: counted() > 500, 30.0)
         load.go(on=False)
         time.sleep(2.5)
         sent, before = load.sent, counted()
@@ -179,62 +170,6 @@ def _present(path: Path) -> int:
     db = sqlite3.connect(path)
     try:
         return int(db.execute("SELECT count(*) FROM trees_local WHERE status = 'present'").fetchone()[0])
-    finally:
-        db.close()
-
-
-def _power_cuts(
-    ground: Ground, load: Load, kills: int, rng: np.random.Generator, tell: Callable[[str], None]
-) -> dict[str, float]:
-    """Kill the station again and again while it writes; each time the file must open and hold all but the last second."""
-    broken, missing_s = 0, [0.0]
-    aircraft = load.aircraft[0]
-    load.go(on=True)
-    for number in range(kills):
-        ground.start("station")
-        _until(ground.served, 30.0)
-        since_s = time.monotonic()
-        _until(lambda since_s=since_s: _version(ground.database) >= _sent_by(aircraft.told, since_s), 20.0)  # type: ignore[misc]
-        time.sleep(float(rng.uniform(0.0, 1.2)))
-        ground.kill("station")
-        killed_s = time.monotonic()
-        kept = _version(ground.database)
-        sound = _sound(ground.database)
-        broken += not sound
-        first_lost_s = next((at for at, version in aircraft.told if version > kept), killed_s)
-        missing_s.append(max(0.0, killed_s - first_lost_s))
-        if not sound or number % 10 == 9:
-            tell(f"power cut {number + 1} of {kills}: {broken} broken, at most {max(missing_s):.2f} s missing")
-    late = sum(s > _MOST_LOST_S for s in missing_s)
-    return {"kills": kills, "files_broken": broken, "missing_s_max": round(max(missing_s), 2), "missing_over_1_s": late}
-
-
-def _sent_by(told: list[tuple[float, int]], at_s: float) -> int:
-    return max((version for when, version in told if when <= at_s), default=0)
-
-
-def _version(path: Path) -> int:
-    """Return the version of the newest list in the file, 0 for none."""
-    if not path.exists():
-        return 0
-    db = sqlite3.connect(path)
-    try:
-        found = db.execute("SELECT max(version) FROM flights").fetchone()[0]
-    except sqlite3.OperationalError:  # killed before its tables were made
-        return 0
-    finally:
-        db.close()
-    return int(found or 0)
-
-
-def _sound(path: Path) -> bool:
-    db = sqlite3.connect(path)
-    try:
-        whole = db.execute("PRAGMA integrity_check").fetchone()[0] == "ok"
-        trees = db.execute("SELECT count(*) FROM trees_local WHERE status = 'present'").fetchone()[0]
-        return bool(whole and trees in (0, 50))
-    except sqlite3.DatabaseError:
-        return False
     finally:
         db.close()
 

@@ -6,12 +6,14 @@ import json
 import signal
 import subprocess
 import sys
+import time
 import urllib.request
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from services.common.errors import GoalNotReachedError
 from services.common.session import free_port
 
 if TYPE_CHECKING:
@@ -65,6 +67,20 @@ class Ground:
         """End both."""
         for name in list(self.processes):
             self.kill(name)
+
+
+def until(condition: Callable[[], bool], timeout_s: float, pause_s: float = 0.05) -> float:
+    """Return the seconds until ``condition`` held.
+
+    Raises:
+        GoalNotReachedError: it did not in time.
+    """
+    begin_s = time.monotonic()
+    while not condition():
+        if time.monotonic() - begin_s > timeout_s:
+            raise GoalNotReachedError(f"bench station: not reached within {timeout_s:g} s")
+        time.sleep(pause_s)
+    return time.monotonic() - begin_s
 
 
 def page_socket(
