@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, ClassVar, Self
 
 import numpy as np
@@ -19,8 +19,8 @@ class Submap:
 
     ``points_m`` (N, 3) float32 in the submap frame; ``view`` (N,) uint16 names for each point the row of
     ``origins_m`` (V, 3) float32, the camera centre it was seen from, so that view rays are known;
-    ``colour`` (N, 3) uint8 RGB or (0, 3). ``T_map_submap`` (4, 4) float64 places it. An empty submap with
-    ``removed`` true withdraws an earlier one.
+    ``colour`` (N, 3) uint8 RGB or (0, 3). ``T_map_submap`` (4, 4) float64 places it. A submap without points moves the
+    points sent before; with ``removed`` true it withdraws them.
     """
 
     SCHEMA: ClassVar[str] = "treedock.submap"
@@ -99,6 +99,19 @@ class Submap:
         )  # fmt: skip
         submap.check()
         return submap
+
+    def after(self, held: Submap | None) -> Submap | None:
+        """Return what there is of the submap after this message, ``held`` being what there was before it.
+
+        A message without points moves the points that are held; None: there is nothing (any more).
+        """
+        if self.removed:
+            return None
+        if len(self.points_m):
+            return self
+        if held is None or held.map_id != self.map_id:
+            return None
+        return replace(held, T_map_submap=self.T_map_submap, graph_version=self.graph_version, stamp_ns=self.stamp_ns)
 
     def check(self) -> None:
         """Raise DecodeError when a value is impossible."""

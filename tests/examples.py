@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from schemas.camera import Intrinsics, RgbdFrame
@@ -50,6 +52,18 @@ def submap() -> Submap:
     origins = np.zeros((1, 3), dtype=np.float32)
     colour = np.array([[1, 2, 3], [4, 5, 6]], dtype=np.uint8)
     return Submap("map-1", 5, 2, 9, 66_000_000, T, points, view, origins, colour)
+
+
+def without_points(
+    whole: Submap, by_m: tuple[float, float, float] = (0.0, 0.0, 0.0), later_s: float = 0.0, *, removed: bool = False
+) -> Submap:
+    """Return the message that moves a submap, or withdraws it."""
+    T = whole.T_map_submap.copy()
+    T[:3, 3] += by_m
+    return replace(
+        whole, T_map_submap=T, points_m=whole.points_m[:0], view=whole.view[:0], colour=whole.colour[:0], removed=removed,
+        stamp_ns=whole.stamp_ns + round(1e9 * later_s),
+    )  # fmt: skip
 
 
 def sketch() -> SubmapSketch:

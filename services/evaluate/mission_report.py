@@ -5,6 +5,7 @@ The data is what crossed the bus; nothing is measured here.
 
 from __future__ import annotations
 
+import datetime as dt
 import html
 import math
 from collections.abc import Sequence
@@ -18,7 +19,11 @@ from schemas.navigation import MissionState
 from schemas.trees import Target, Tree
 from services.evaluate.exports import Stamped
 from services.evaluate.report import STYLE, filters_section, table, tree_table, trunks_section
+from services.evaluate.timeline import timeline_svg
 from services.evaluate.top_view import top_view_svg
+
+_SIMULATED_BEFORE_S = 1e9
+"""Simulated time begins at zero: stamps before 2001 are no hour of any day."""
 
 
 @dataclass(slots=True)
@@ -43,13 +48,28 @@ def mission_report(story: Story) -> bytes:
     body = [
         "<!doctype html>", '<html lang="en"><head><meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width">', f"<title>{html.escape(title)}</title>",
-        f"<style>{STYLE}</style></head><body>", f"<h1>{html.escape(title)}</h1>", _cards(story),
-        "<h2>What happened</h2>", _events(story.states), *_choice(story), "<h2>Trees</h2>", tree_table(story.trees),
+        f"<style>{STYLE}</style></head><body>", f"<h1>{html.escape(title)}</h1>", _verdict(story), _cards(story),
+        "<h2>What happened</h2>", timeline_svg(story.states, story.targets), _events(story.states), *_choice(story),
+        "<h2>Trees</h2>", tree_table(story.trees),
         "<h2>From above</h2>", top_view_svg(story.trees, story.trajectory, story.points_m),
         *trunks_section(story.trees, story.points_m), *filters_section(story.targets), *_services(story.health),
         "</body></html>",
     ]  # fmt: skip
     return ("\n".join(body) + "\n").encode()
+
+
+def _verdict(story: Story) -> str:
+    """Return how it ended in one sentence, with the hour."""
+    if not story.states:
+        return '<p class="verdict">No mission was heard of.</p>'
+    last = story.states[-1]
+    good = last.state == "landed" and last.docked_count > 0
+    count = f"{last.docked_count} tree{'' if last.docked_count == 1 else 's'}"
+    words = f"Docked at {count}. Ended {last.state.replace('_', ' ')}: {last.reason}."
+    begun_s = 1e-9 * story.states[0].stamp_ns
+    if begun_s > _SIMULATED_BEFORE_S:
+        words += f" Begun {dt.datetime.fromtimestamp(begun_s, dt.UTC):%Y-%m-%d %H:%M:%S} UTC."
+    return f'<p class="verdict {"good" if good else "warn"}">{html.escape(words)}</p>'
 
 
 def _cards(story: Story) -> str:

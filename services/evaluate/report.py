@@ -15,16 +15,27 @@ from services.evaluate.report_pictures import cross_section_svg, filter_plots_sv
 from services.evaluate.top_view import top_view_svg
 
 _MAX_PICTURES = 60
+_FILES = (
+    ("trees.gpkg, trees.geojson, trees.csv", "the trees; QGIS opens the GeoPackage as it is (metres in the map's own frame, or global with a start point)"),
+    ("trees.json", "the trees with everything that is known of them"),
+    ("cloud.laz, cloud.ply", "the map's points; CloudCompare and QGIS open both"),
+    ("trajectory.txt, trajectory_online.txt", "the camera's path in TUM's format: final estimate, and as a live run would have told it"),
+    ("targets.jsonl", "the tracked trunk in each frame"),
+    ("metrics.json", "the figures of this page"),
+)  # fmt: skip
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 60rem; padding: 0 1rem; color: #1d2a20; }
 h1, h2 { font-weight: 600; } table { border-collapse: collapse; margin: 0.5rem 0 1.5rem; }
 th, td { padding: 0.2rem 0.7rem; text-align: right; border-bottom: 1px solid #d5ddd6; font-variant-numeric: tabular-nums; }
 th:first-child, td:first-child, .left2 th:nth-child(-n+3), .left2 td:nth-child(-n+3), .left5 th, .left5 td { text-align: left; }
 svg { width: 100%; height: auto; background: #f6f8f5; border: 1px solid #d5ddd6; }
-.warn { color: #9a3412; }
+.warn { color: #9a3412; } .wide { overflow-x: auto; } p { max-width: 46rem; }
+.verdict { padding: 0.6rem 1rem; border-left: 6px solid #9aa69d; background: #f6f8f5; font-size: 1.1rem; font-weight: 600; }
+.verdict.good { border-color: #15803d; color: #14532d; } .verdict.warn { border-color: #d97706; }
 .trunks { display: flex; flex-wrap: wrap; gap: 0.75rem; } .trunks svg { width: 190px; }
 .cards { display: flex; flex-wrap: wrap; gap: 0.75rem; }
 .cards div { flex: 1 1 7.5rem; border: 1px solid #d5ddd6; border-radius: 6px; padding: 0.5rem 0.8rem; }
+@media print { body { margin: 0; max-width: none; } h2, svg, tr { break-inside: avoid; } }
 .cards small { display: block; color: #5c6b60; } .cards b { font-size: 1.4rem; font-weight: 600; }
 """
 
@@ -43,7 +54,8 @@ def report_bytes(
         "<!doctype html>", '<html lang="en"><head><meta charset="utf-8">', f"<title>{html.escape(title)}</title>",
         f"<style>{STYLE}</style></head><body>", f"<h1>{html.escape(title)}</h1>", _summary(values), *bad,
         "<h2>Trees</h2>", tree_table(trees), "<h2>From above</h2>", top_view_svg(trees, trajectory, points_m),
-        *trunks_section(trees, points_m), *filters_section(targets), "<h2>Time</h2>", _timings(values["ms"]), "</body></html>",
+        *trunks_section(trees, points_m), *filters_section(targets), "<h2>Time</h2>", _timings(values["ms"]),
+        "<h2>Files beside this page</h2>", table(("file", "what it is"), _FILES, left=2), "</body></html>",
     ]  # fmt: skip
     return ("\n".join(body) + "\n").encode()
 
@@ -53,7 +65,7 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]], left: int = 1) -> 
     heads = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
     lines = ["<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
     words = f' class="left{left}"' if left > 1 else ""
-    return "\n".join([f"<table{words}>", f"<tr>{heads}</tr>", *lines, "</table>"])
+    return "\n".join(['<div class="wide">', f"<table{words}>", f"<tr>{heads}</tr>", *lines, "</table></div>"])
 
 
 def _summary(values: Mapping[str, Any]) -> str:
@@ -77,29 +89,18 @@ def tree_table(trees: Sequence[Tree]) -> str:
     """Return the trees as a table."""
     if not trees:
         return "<p>No trees were found.</p>"
-    head = (
-        "tree",
-        "x m",
-        "y m",
-        "ground m",
-        "radius cm",
-        "at m",
-        "seen m",
-        "lean °",
-        "arc °",
-        "confidence",
-        "suitable",
-    )
+    head = ("tree", "x m", "y m", "± cm", "ground m", "diameter cm", "± cm", "at m", "seen m", "lean °", "arc °", "confidence", "suitable")  # fmt: skip
     rows = []
     for row in tree_rows(trees):
         lean_deg = np.degrees(np.arccos(np.clip(row["axis"][2], -1.0, 1.0)))
         rows.append((
-            f"{row['id']}", f"{row['x_m']:.2f}", f"{row['y_m']:.2f}", f"{row['z_m']:.2f}",
-            f"{100.0 * row['radius_m']:.1f}", f"{row['radius_height_m']:.2f}", f"{row['height_seen_m']:.2f}",
+            f"{row['id']}", f"{row['x_m']:.2f}", f"{row['y_m']:.2f}", f"{100.0 * row['sigma_xy_m']:.1f}", f"{row['z_m']:.2f}",
+            f"{200.0 * row['radius_m']:.1f}", f"{200.0 * row['sigma_radius_m']:.1f}", f"{row['radius_height_m']:.2f}", f"{row['height_seen_m']:.2f}",
             f"{lean_deg:.1f}", f"{np.degrees(row['arc_rad']):.0f}", f"{row['confidence']:.2f}",
             "yes" if row["suitable"] else "no",
         ))  # fmt: skip
-    return table(head, rows)
+    words = "Diameters and their standard deviations at the height named; x ahead and y left of the start, ground is z where the trunk meets it."
+    return f"<p>{words}</p>\n" + table(head, rows)
 
 
 def trunks_section(trees: Sequence[Tree], points_m: NDArray[np.float32]) -> list[str]:

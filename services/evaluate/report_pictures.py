@@ -45,7 +45,7 @@ def cross_section_svg(tree: Tree, points_m: NDArray[np.float32]) -> str:
         f'<path d="M8 {_SIDE_PX - 8:.0f}h{bar_px:.1f}" stroke="{_INK}" stroke-width="2"/>',
         f'<text x="8" y="{_SIDE_PX - 13:.0f}" fill="{_INK}">10 cm</text>',
         f'<text x="4" y="{_SIDE_PX + 15:.0f}" font-weight="600">{tree.id}: {200.0 * tree.radius_m:.1f} ± {200.0 * tree.sigma_radius_m:.1f} cm</text>',
-        f'<text x="4" y="{_SIDE_PX + 31:.0f}" fill="{_FAINT}">at {tree.radius_height_m:.2f} m, {len(slice_m)} points shown</text>',
+        f'<text x="4" y="{_SIDE_PX + 31:.0f}" fill="{_FAINT}">at {tree.radius_height_m:.2f} m, {f"{len(slice_m)} points shown" if len(slice_m) else "no map points here"}</text>',
         "</svg>",
     ])  # fmt: skip
 
@@ -74,11 +74,13 @@ def filter_plots_svg(targets: Sequence[Target]) -> str:
         ("range (m)", 1.0, [t.raw_range_m for t in tracked], [t.range_m for t in tracked]),
         ("radius (cm)", 100.0, [t.raw_radius_m for t in tracked], [t.radius_m for t in tracked]),
     )
+    # what was never measured (a source that tells no pixels) has no plot
+    rows = tuple(row for row in rows if np.isfinite(_numbers([*row[2], *row[3]], 1.0)).any())
     plots = [
         _plot(k, name, seconds, _numbers(raw, factor), _numbers(filtered, factor), breaks)
         for k, (name, factor, raw, filtered) in enumerate(rows)
     ]
-    height = 3 * (_PLOT_HEIGHT_PX + 24.0) + 22.0
+    height = len(rows) * (_PLOT_HEIGHT_PX + 24.0) + 22.0
     legend = (
         f'<g transform="translate({_LEFT_PX:.0f} {height - 6:.0f})"><circle cx="4" cy="-4" r="2" fill="{_RAW}"/><text x="12">measured in one frame</text>'
         f'<path d="M170 -4h22" stroke="{_FIT}" stroke-width="2"/><text x="198">filtered</text></g>'

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
-from numpy.typing import NDArray
 
 from schemas.codec import Wire
 from schemas.health import Health
@@ -25,7 +26,8 @@ class Chronicle:
     def __init__(self, uav: str) -> None:
         self._uav = uav
         self._story = Story(uav=uav)
-        self._clouds: dict[int, NDArray[np.float32]] = {}
+        self._clouds: dict[int, Submap] = {}
+        """Thinned; of the points alone is made use."""
 
     @property
     def told(self) -> bool:
@@ -61,12 +63,12 @@ class Chronicle:
             story.trajectory.append((pose.stamp_ns, from_transform(pose.T_map_camera)))
 
     def _take_submap(self, submap: Submap) -> None:
-        if submap.removed:
+        now = submap.after(self._clouds.get(submap.submap_id))
+        if now is None:
             self._clouds.pop(submap.submap_id, None)
             return
-        step = max(1, len(submap.points_m) // _POINTS_A_SUBMAP)
-        points = apply(submap.T_map_submap, submap.points_m[::step].astype(np.float64))
-        self._clouds[submap.submap_id] = points.astype(np.float32)
+        step = max(1, len(now.points_m) // _POINTS_A_SUBMAP)
+        self._clouds[submap.submap_id] = replace(now, points_m=now.points_m[::step])
 
     def _take_state(self, state: MissionState) -> bool:
         story = self._story
@@ -82,8 +84,8 @@ class Chronicle:
     def story(self) -> Story:
         """Return what a report is made from."""
         story = self._story
-        clouds = [cloud for _, cloud in sorted(self._clouds.items())]
-        story.points_m = np.concatenate(clouds) if clouds else np.empty((0, 3), np.float32)
+        clouds = [apply(s.T_map_submap, s.points_m.astype(np.float64)) for _, s in sorted(self._clouds.items())]
+        story.points_m = np.concatenate(clouds).astype(np.float32) if clouds else np.empty((0, 3), np.float32)
         return Story(
             story.uav, story.map_id, thinned(story.trajectory), story.trees, story.targets, story.states, story.health,
             story.points_m,

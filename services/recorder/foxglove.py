@@ -116,10 +116,11 @@ class _Cloud:
         if submap.map_id != self._map_id:
             self._submaps.clear()
             self._map_id = submap.map_id
-        if submap.removed:
+        now = submap.after(self._submaps.get(submap.submap_id))
+        if now is None:
             self._submaps.pop(submap.submap_id, None)
         else:
-            self._submaps[submap.submap_id] = submap
+            self._submaps[submap.submap_id] = now
         if submap.stamp_ns < self._next_ns or not self._submaps:
             return []
         self._next_ns = submap.stamp_ns + _CLOUD_PERIOD_NS

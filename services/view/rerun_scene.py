@@ -114,6 +114,8 @@ class Scene:
             return
         T = submap.T_map_submap
         self._log(entity, self._rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
+        if not len(submap.points_m):
+            return  # the graph moved it: its points stay as they are, in a frame that has moved
         colours = submap.colour if len(submap.colour) else None
         self._log(entity, self._rr.Points3D(submap.points_m, colors=colours, radii=0.006))
 

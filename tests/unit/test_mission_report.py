@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any, cast
 from xml.etree import ElementTree as ET
@@ -20,7 +21,7 @@ from services.evaluate.mission_report import Story, mission_report, thinned
 from services.recorder.chronicle import Chronicle
 from services.recorder.config import RecorderConfig
 from services.recorder.service import build
-from tests.examples import all_messages
+from tests.examples import all_messages, submap, without_points
 
 SECOND = 10**9
 
@@ -74,7 +75,7 @@ def test_a_mission_that_ends_has_its_report_beside_the_recording(tmp_path: Path)
     page = path.read_text()
     for words in ("0.95 m for 3 s", "tree 7: tree 7 is the nearest", "landed", "1.5 m reached", "<b>1</b>"):
         assert words in page
-    assert page.count("start was commanded") == 1, "a state that is repeated is one event"
+    assert page.count("<td>start was commanded</td>") == 1, "a state that is repeated is one event"
 
 
 def test_two_missions_are_two_reports_and_a_broken_one_is_told_at_the_stop(tmp_path: Path) -> None:
@@ -104,6 +105,42 @@ def test_every_story_gives_a_whole_page(story: Story) -> None:
     page = mission_report(story).decode()
     body = page[page.index("<body>") : page.index("</body>") + 7]
     ET.fromstring(body.replace("&nbsp;", " "))
+
+
+def test_the_page_says_how_it_ended_and_shows_it_over_time() -> None:
+    targets = [
+        example(Target).model_copy(update={"stamp_ns": round((20 + k) * SECOND), "range_m": 3.0 - 0.2 * k})
+        for k in range(10)
+    ]
+    page = mission_report(
+        Story(uav="uav1", states=list(MISSION), trees=example(TreeList).trees, targets=targets)
+    ).decode()
+    assert "Docked at 1 tree. Ended landed: on the ground." in page
+    assert 'class="verdict good"' in page
+    bars = re.findall(r'<rect x="([\d.]+)" y="20" width="([\d.]+)"[^>]*><title>(\w+)', page)
+    assert [name for _, _, name in bars] == ["take", "scan", "approach", "docked"]
+    ends = [float(x) + float(wide) for x, wide, _ in bars]
+    assert [float(x) for x, _, _ in bars[1:]] == pytest.approx(ends[:-1], abs=0.2), "they follow one another"
+    assert float(bars[1][1]) == pytest.approx(14 / 39 * (720 - 68), abs=0.2), "a second is as wide everywhere"
+    assert "distance to the tree" in page
+    tree = example(TreeList).trees[0]
+    row = f"<td>{200 * tree.radius_m:.1f}</td><td>{200 * tree.sigma_radius_m:.1f}</td>"
+    assert row in page, "diameter and its sigma"
+    failed = mission_report(Story(states=[*MISSION[:2], state("failed", "no tree was found", 9.0)])).decode()
+    assert 'class="verdict warn"' in failed
+
+
+def test_a_submap_that_the_graph_moved_keeps_its_points() -> None:
+    chronicle = Chronicle("uav1")
+    whole = submap()
+    chronicle.hear(whole)
+    before = chronicle.story().points_m
+    chronicle.hear(without_points(whole, (10.0, 0.0, 0.0)))
+    assert chronicle.story().points_m == pytest.approx(before + np.float32([10.0, 0.0, 0.0]))
+    chronicle.hear(without_points(whole, removed=True))
+    assert len(chronicle.story().points_m) == 0
+    chronicle.hear(without_points(whole))
+    assert len(chronicle.story().points_m) == 0, "a place without points is nothing"
 
 
 def test_another_map_begins_the_path_anew() -> None:

@@ -28,13 +28,14 @@ from services.common.errors import InputError
 from services.common.memory import Hub
 from services.recorder.config import RecorderConfig
 from services.recorder.drain import Drain, Entry, Limits
+from services.recorder.foxglove import Translator
 from services.recorder.index import index
 from services.recorder.mcap_file import McapFile
 from services.recorder.reader import Recorded, messages
 from services.recorder.recover import is_whole, recover, recover_folder
 from services.recorder.replay import Span, check
 from services.recorder.service import build, recorded_topics
-from tests.examples import all_messages
+from tests.examples import all_messages, submap, without_points
 
 INTRINSICS = Intrinsics(width=64, height=48, fx=50.0, fy=50.0, cx=31.5, cy=23.5)
 MB = 1_000_000
@@ -121,6 +122,17 @@ def test_foxglove_finds_its_schemas(tmp_path: Path) -> None:
     assert scene.entities[0].cylinders[0].size.x == pytest.approx(2 * trees[0].radius_m)
 
 
+def test_foxglove_keeps_the_points_of_a_submap_that_the_graph_moved() -> None:
+    translator, whole = Translator("uav1", 5.0), submap()
+    ((name, first),) = translator.translate(whole)
+    moved = without_points(whole, (1.0, 0.0, 0.0), later_s=6.0)
+    ((_, second),) = translator.translate(moved)
+    assert name == "/uav1/cloud"
+    size = cast("Any", first).point_stride * len(whole.points_m)
+    assert len(cast("Any", first).data) == len(cast("Any", second).data) == size
+    assert cast("Any", first).data != cast("Any", second).data
+
+
 def test_a_file_cut_anywhere_is_mended(tmp_path: Path) -> None:
     whole = recorded(tmp_path / "whole", frames=30).read_bytes()
     counts = []
@@ -178,6 +190,7 @@ WRITER = """
 import sys, time
 from pathlib import Path
 from services.recorder.drain import Drain, Entry, Limits
+from services.recorder.foxglove import Translator
 from services.recorder.mcap_file import McapFile
 drain = Drain(lambda: McapFile(Path(sys.argv[1])), Limits(0.1, 10**9, 10**8, 0), lambda: 10**12)
 print("begun", flush=True)

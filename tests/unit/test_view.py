@@ -11,7 +11,7 @@ import pytest
 
 from services.cli.app import invoke
 from services.view.rerun_scene import Scene
-from tests.examples import all_messages
+from tests.examples import all_messages, submap, without_points
 
 
 class Recorder(ModuleType):
@@ -46,6 +46,15 @@ def test_every_message_with_a_picture_is_shown() -> None:
     )
     assert scene.shown == 7
     assert all(timeline == "stamp" for timeline, _ in rerun.times)
+
+
+def test_a_submap_that_the_graph_moved_keeps_its_points() -> None:
+    rerun, whole = Recorder(), submap()
+    scene = Scene(rerun, object())
+    scene.show(whole)
+    logged = rerun.logged["map/cloud/5"]
+    scene.show(without_points(whole, (1.0, 0.0, 0.0)))
+    assert rerun.logged["map/cloud/5"] == logged + 1, "a new place, and no empty cloud over the old points"
 
 
 def test_the_lens_is_told_once_and_a_new_map_clears_the_old() -> None:

@@ -1,0 +1,91 @@
+"""A mission over time as inline SVG: a bar of its states, and the distance to the tree below it. Pure."""
+
+from __future__ import annotations
+
+import html
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from schemas.navigation import MissionState
+from schemas.trees import Target
+
+_WIDTH_PX, _BAR_PX, _PLOT_PX, _LEFT_PX = 720.0, 34.0, 130.0, 62.0
+_INK, _FAINT, _LINE, _BAND = "#1d2a20", "#5c6b60", "#15803d", "#bbf7d0"
+_COLOURS = {
+    "take_off": "#bfdbfe", "scan": "#99f6e4", "select": "#99f6e4", "face": "#c7d2fe", "approach": "#a5b4fc", "dock": "#86efac",
+    "docked": "#22c55e", "undock": "#c7d2fe", "return": "#bfdbfe", "landing": "#bfdbfe", "landed": "#e5e7eb", "hold": "#fcd34d",
+    "failed": "#fca5a5", "released": "#fca5a5",
+}  # fmt: skip
+_OTHER = "#e5e7eb"
+_DOCK_M = (0.85, 1.00)
+"""Where a mission is docked: camera to trunk axis."""
+_LETTER_PX = 6.8
+_GAP_S = 0.5
+
+
+def timeline_svg(states: Sequence[MissionState], targets: Sequence[Target] = ()) -> str:
+    """Return the picture; empty when fewer than two states were told."""
+    if len(states) < 2 or states[-1].stamp_ns <= states[0].stamp_ns:
+        return ""
+    begin_ns, end_ns = states[0].stamp_ns, states[-1].stamp_ns
+    scale = (_WIDTH_PX - _LEFT_PX - 6.0) / (end_ns - begin_ns)
+    ranges = [
+        (t.stamp_ns, t.range_m) for t in targets
+        if t.status == "tracking" and t.range_m is not None and begin_ns <= t.stamp_ns <= end_ns
+    ]  # fmt: skip
+    height = 20.0 + _BAR_PX + (18.0 + _PLOT_PX if len(ranges) > 1 else 0.0) + 22.0
+    parts = [
+        f'<svg viewBox="0 0 {_WIDTH_PX:.0f} {height:.0f}" role="img" aria-label="states over time" font-size="12">'
+    ]
+    for a, b in itertools.pairwise(states):
+        x, wide = _LEFT_PX + scale * (a.stamp_ns - begin_ns), scale * (b.stamp_ns - a.stamp_ns)
+        word = a.state.replace("_", " ")
+        parts.append(
+            f'<rect x="{x:.1f}" y="20" width="{max(wide, 0.5):.1f}" height="{_BAR_PX:.0f}" fill="{_COLOURS.get(a.state, _OTHER)}" '
+            f'stroke="#fff"><title>{html.escape(f"{word}: {a.reason}")}</title></rect>'
+        )
+        if wide > _LETTER_PX * len(word) + 6.0:
+            parts.append(f'<text x="{x + 5:.1f}" y="{24 + _BAR_PX / 2:.0f}" fill="{_INK}">{html.escape(word)}</text>')
+    parts += _seconds(1e-9 * (end_ns - begin_ns), 1e9 * scale, height)
+    if len(ranges) > 1:
+        parts += _distances(ranges, begin_ns, scale, 20.0 + _BAR_PX + 18.0)
+    return "\n".join([*parts, "</svg>"])
+
+
+def _seconds(span_s: float, px_per_s: float, height: float) -> list[str]:
+    """Return a mark every so many seconds, about ten of them."""
+    step = next(s for s in (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1800, 3600, 10**9) if s * px_per_s >= 55.0)
+    parts = []
+    for k in range(int(span_s // step) + 1):
+        x = _LEFT_PX + k * step * px_per_s
+        parts.append(
+            f'<line x1="{x:.1f}" x2="{x:.1f}" y1="16" y2="{height - 18:.0f}" stroke="{_INK}" stroke-opacity="0.12"/>'
+        )
+        parts.append(f'<text x="{x:.1f}" y="{height - 5:.0f}" text-anchor="middle" fill="{_FAINT}">{k * step} s</text>')
+    return parts
+
+
+def _distances(ranges: Sequence[tuple[int, float]], begin_ns: int, scale: float, top: float) -> list[str]:
+    """Return the distance to the tree over time, with the band in which it is docked."""
+    high = max(1.3, float(np.percentile([r for _, r in ranges], 99.0)) * 1.05)
+    low = min(0.7, min(r for _, r in ranges))
+
+    def y(metres: float) -> float:
+        return top + (high - min(high, metres)) / (high - low) * _PLOT_PX
+
+    path, last_ns = [], -(10**18)
+    for stamp_ns, metres in ranges[:: max(1, len(ranges) // 1500)]:
+        path.append(
+            f"{'M' if stamp_ns - last_ns > _GAP_S * 1e9 else 'L'}{_LEFT_PX + scale * (stamp_ns - begin_ns):.1f} {y(metres):.1f}"
+        )
+        last_ns = stamp_ns
+    wide = _WIDTH_PX - _LEFT_PX - 6.0
+    return [
+        f'<rect x="{_LEFT_PX:.0f}" y="{y(_DOCK_M[1]):.1f}" width="{wide:.0f}" height="{y(_DOCK_M[0]) - y(_DOCK_M[1]):.1f}" fill="{_BAND}"/>',
+        f'<rect x="{_LEFT_PX:.0f}" y="{top:.0f}" width="{wide:.0f}" height="{_PLOT_PX:.0f}" fill="none" stroke="#d5ddd6"/>',
+        *(f'<text x="{_LEFT_PX - 6:.0f}" y="{y(m) + 4:.1f}" text-anchor="end" fill="{_FAINT}">{m:.2f} m</text>' for m in (high, *_DOCK_M, low)),
+        f'<text x="{_LEFT_PX:.0f}" y="{top - 5:.0f}" font-weight="600">distance to the tree, green where it is docked</text>',
+        f'<path d="{"".join(path)}" fill="none" stroke="{_LINE}" stroke-width="1.8"/>',
+    ]  # fmt: skip
