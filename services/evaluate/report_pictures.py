@@ -69,13 +69,13 @@ def filter_plots_svg(targets: Sequence[Target]) -> str:
     seconds = np.array([1e-9 * (t.stamp_ns - begin_ns) for t in tracked])
     other = [False, *(a.tree_id != b.tree_id for a, b in itertools.pairwise(tracked))]
     breaks = np.array(other) | np.concatenate([[True], np.diff(seconds) > _GAP_S])
-    rows = (
+    rows = [
         ("x in the image (px)", 1.0, [t.raw_image_x_px for t in tracked], [t.image_x_px for t in tracked]),
         ("range (m)", 1.0, [t.raw_range_m for t in tracked], [t.range_m for t in tracked]),
         ("radius (cm)", 100.0, [t.raw_radius_m for t in tracked], [t.radius_m for t in tracked]),
-    )
+    ]
     # what was never measured (a source that tells no pixels) has no plot
-    rows = tuple(row for row in rows if np.isfinite(_numbers([*row[2], *row[3]], 1.0)).any())
+    rows = [row for row in rows if np.isfinite(_numbers([*row[2], *row[3]], 1.0)).any()]
     plots = [
         _plot(k, name, seconds, _numbers(raw, factor), _numbers(filtered, factor), breaks)
         for k, (name, factor, raw, filtered) in enumerate(rows)

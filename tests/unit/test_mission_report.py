@@ -136,7 +136,7 @@ def test_a_submap_that_the_graph_moved_keeps_its_points() -> None:
     chronicle.hear(whole)
     before = chronicle.story().points_m
     chronicle.hear(without_points(whole, (10.0, 0.0, 0.0)))
-    assert chronicle.story().points_m == pytest.approx(before + np.float32([10.0, 0.0, 0.0]))
+    assert chronicle.story().points_m == pytest.approx(before + np.array([10.0, 0.0, 0.0]))
     chronicle.hear(without_points(whole, removed=True))
     assert len(chronicle.story().points_m) == 0
     chronicle.hear(without_points(whole))
