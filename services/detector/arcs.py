@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from services.common.kernels import solve_positive
 from services.detector.config import DetectorConfig
@@ -15,17 +16,22 @@ from services.detector.ray import point_sigma, residual
 from services.detector.seeds import GOOD, best_seed, circle_score
 from services.detector.voxels import Slices
 
+Floats32 = NDArray[np.float32]
+Ints32 = NDArray[np.int32]
+
 _COLUMNS = 10
 """layer, x, y, z, radius, noise, points on, points inside, arc, range."""
 _PER_CLUSTER = 5
-_MOST = 240
-"""Points of one circle that its fit uses at most; the joint fit of the trunk uses more."""
+_MOST = 120
+"""Points of one circle that its fit uses at most: slices only propose, the joint fit of the trunk uses all."""
 BINS = 36
 """Bins of the arc coverage, 10 degrees each."""
-_PLENTY = 200
-_SKIP = 3
-"""Of a cluster of so many points every second is taken, of twice as many every third: the joint fit uses them all."""
-_TURNS = 6
+_PLENTY = 120
+_SKIP = 4
+"""Of a cluster of so many points every second is taken, of twice as many every third, of more every fourth."""
+_TURNS = 4
+_CLOSE_M = 1e-3
+"""A step of this size ends the fit."""
 _SURE = 12.0
 """A circle from below with such a score, and as good as it was there, needs no rival."""
 
@@ -100,7 +106,7 @@ def _refine(
         for a in range(3):
             c[a] += limit * x[a]
         c[2] = min(max(c[2], 0.5 * r_min), 1.5 * r_max)
-        if step < 2e-4:
+        if step < _CLOSE_M:
             break
     return scale
 
@@ -145,18 +151,22 @@ def _judge(
 
 @njit(cache=True, nogil=True)
 def _load(
-    xyz: Floats, ray: Floats, begin: int, end: int, every: int, k_range: float, surface: float, spacing: float, P: Floats,
-    U: Floats, G: Floats, S: Floats,
+    xyz: Floats32, view: Ints32, origins: Floats, begin: int, end: int, every: int, k_range: float, surface: float,
+    spacing: float, P: Floats, U: Floats, G: Floats, S: Floats,
 ) -> int:  # fmt: skip
     """Copy a cluster's points, unit rays in the plan, ranges, and how far a point may be from a seed circle."""
     q = 0
+    with_views = view.shape[0] > 0
     for v in range(begin, end, every):
-        flat = np.sqrt(ray[v, 0] ** 2 + ray[v, 1] ** 2)
-        G[q] = np.sqrt(flat * flat + ray[v, 2] ** 2)
         for a in range(3):
             P[q, a] = xyz[v, a]
-        for a in range(2):
-            U[q, a] = ray[v, a] / flat if flat > 1e-6 else 0.0
+        U[q, 0], U[q, 1], G[q] = 0.0, 0.0, 0.0
+        if with_views:
+            rx, ry, rz = P[q, 0] - origins[view[v], 0], P[q, 1] - origins[view[v], 1], P[q, 2] - origins[view[v], 2]
+            flat = np.sqrt(rx * rx + ry * ry)
+            G[q] = np.sqrt(flat * flat + rz * rz)
+            if flat > 1e-6:
+                U[q, 0], U[q, 1] = rx / flat, ry / flat
         S[q] = 2.0 * np.sqrt((k_range * G[q] ** 2) ** 2 + surface * surface) + 0.25 * spacing
         q += 1
     return q
@@ -222,8 +232,9 @@ def _circles_of_cluster(
 
 @njit(cache=True, nogil=True)
 def _all_slices(
-    xyz: Floats, ray: Floats, begin: Ints, from_cluster: int, to_cluster: int, z_low: float, layer_m: float, k_range: float,
-    surface: float, spacing: float, r_min: float, r_max: float, min_points: int, trials: int, seed: int, out: Floats,
+    xyz: Floats32, view: Ints32, origins: Floats, begin: Ints, from_cluster: int, to_cluster: int, z_low: float,
+    layer_m: float, k_range: float, surface: float, spacing: float, r_min: float, r_max: float, min_points: int, trials: int,
+    seed: int, out: Floats,
 ) -> int:  # fmt: skip
     rows, largest = 0, 0
     for c in range(from_cluster, to_cluster):
@@ -236,8 +247,8 @@ def _all_slices(
             continue
         state[0] = seed + 7919 * c
         every = min(_SKIP, 1 + size // _PLENTY)
-        n = _load(xyz, ray, begin[c], begin[c + 1], every, k_range, surface, spacing, P, U, G, S)
-        tries = trials if size < 2 * _PLENTY else 2 * trials
+        n = _load(xyz, view, origins, begin[c], begin[c + 1], every, k_range, surface, spacing, P, U, G, S)
+        tries = trials if size < 3 * _PLENTY else 2 * trials
         level = np.floor((P[0, 2] - z_low) / layer_m)
         room = out[rows : min(rows + _PER_CLUSTER, out.shape[0])]
         rows += _circles_of_cluster(
@@ -265,8 +276,7 @@ def fit_slices(slices: Slices, low: Floats, config: DetectorConfig) -> Circles:
     """Return the circles found in every cluster of every slice (several where a cluster holds several)."""
     begin, voxels = slices.begin, slices.voxels
     last = len(begin) - 1
-    split = _split(slices, float(low[2]))
-    ends = ((0, split), (split, last))
+    ends = ((0, slices.split), (slices.split, last))
     outs: list[Floats] = [np.zeros((0, _COLUMNS)), np.zeros((0, _COLUMNS))]
 
     def work(half: int) -> None:
@@ -274,7 +284,7 @@ def fit_slices(slices: Slices, low: Floats, config: DetectorConfig) -> Circles:
         clusters = int(np.count_nonzero(np.diff(begin[first : end + 1]) >= config.min_slice_points))
         out = np.zeros((_PER_CLUSTER * clusters + 8, _COLUMNS))
         rows = _all_slices(
-            voxels.xyz_m, voxels.ray_m, begin, first, end, float(low[2]), slices.layer_m, config.range_noise_per_m,
+            voxels.xyz_m, voxels.view, voxels.origins_m, begin, first, end, float(low[2]), slices.layer_m, config.range_noise_per_m,
             config.surface_noise_m, slices.spacing_m, config.min_radius_m, config.max_radius_m, config.min_slice_points,
             config.trials, config.seed, out,
         )  # fmt: skip
@@ -289,11 +299,3 @@ def fit_slices(slices: Slices, low: Floats, config: DetectorConfig) -> Circles:
         out[:, 0].astype(np.int64), np.ascontiguousarray(out[:, 1:4]), np.ascontiguousarray(out[:, 4]), out[:, 5].copy(),
         out[:, 6].astype(np.int64), out[:, 7].astype(np.int64), out[:, 8].copy(), out[:, 9].copy(),
     )  # fmt: skip
-
-
-def _split(slices: Slices, z_low: float) -> int:
-    """Return the first cluster of the upper half of the slices' voxels, at the border of a slice."""
-    begin = slices.begin
-    cluster = int(np.searchsorted(begin, begin[-1] // 2))
-    level = np.floor((slices.voxels.xyz_m[begin[:-1], 2] - z_low) / slices.layer_m) if len(begin) > 1 else np.zeros(0)
-    return int(np.searchsorted(level, level[min(cluster, len(level) - 1)])) if len(level) else 0

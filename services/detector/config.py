@@ -44,6 +44,8 @@ class DetectorConfig(BaseModel):
     """Depth noise at one metre, growing with the square of range: s/(f B) = 0.08 px / (565 px * 0.070 m)."""
     surface_noise_m: float = 0.006
     """Bark, registration and quantisation: noise of a surface point whatever the range."""
+    view_noise_m: float = Field(default=0.010, gt=0.0)
+    """By how much, per axis, what one keyframe shows of a trunk lies beside what another shows: poses, fixed pattern."""
     out_of_round: float = Field(default=0.026, ge=0.0)
     """Share of the radius by which the side that shows differs from the whole trunk; more points do not tell."""
     off_centre: float = Field(default=0.033, ge=0.0)

@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from services.detector.axis_fit import fit_axis
 from services.detector.config import DetectorConfig
-from services.detector.cylinder_kernels import assess, fit_axis
+from services.detector.cylinder_kernels import assess
 from services.detector.facing import facing
 from services.detector.model import Floats
 from services.detector.stacks import Stack
@@ -25,6 +26,10 @@ _PRIOR_TAPER = 0.008
 _MEAN_TAPER = -0.006
 _CORRELATED = 12.0
 """Neighbouring points share fixed-pattern noise and bark: so many of them count as one in the covariance."""
+_HELD = 1e12
+"""Inverse variance of a view's offset where there is to be none."""
+_BY_VIEW = np.zeros(3)
+"""What tells the rays: each point's view, where it is known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,12 +105,12 @@ def _margin_m(stack: Stack, config: DetectorConfig) -> float:
 def fit_cylinder(voxels: Voxels, stack: Stack, config: DetectorConfig) -> Cylinder | None:
     """Return the joint fit of a candidate, or None when too few points remain or it leaves its slices."""
     if voxels.seen_from:
-        found = _fitted(voxels, voxels.ray_m, stack, config, 1.0, _priors(stack.radius_m))
+        found = _fitted(voxels, _BY_VIEW, stack, config, 1.0, _priors(stack.radius_m))
         if found is None:  # plants beside the trunk pulled it away: nearer to the slices, whose median they do not move
-            found = _fitted(voxels, voxels.ray_m, stack, config, 1.0, _priors(stack.radius_m, 0.5), 0.5)
+            found = _fitted(voxels, _BY_VIEW, stack, config, 1.0, _priors(stack.radius_m, 0.5), 0.5)
         return None if found is None else _measured(found, config)
     # without views the noise is not known beforehand
-    found = _fitted(voxels, voxels.ray_m, stack, config, 3.0, _priors(stack.radius_m))
+    found = _fitted(voxels, _BY_VIEW, stack, config, 3.0, _priors(stack.radius_m))
     if found is None:
         return None
     faced = _as_faced(voxels, stack, found, config)
@@ -113,13 +118,16 @@ def fit_cylinder(voxels: Voxels, stack: Stack, config: DetectorConfig) -> Cylind
 
 
 def _fitted(
-    voxels: Voxels, ray: Floats, stack: Stack, config: DetectorConfig, start: float, prior: Floats, reach: float = 1.0
+    voxels: Voxels, told: Floats, stack: Stack, config: DetectorConfig, start: float, prior: Floats, reach: float = 1.0
 ) -> _Fit | None:  # fmt: skip
+    """Return the fit; ``told``: what tells the rays (``_ray_to``). Only known views have errors of their own."""
+    held = 1.0 / config.view_noise_m**2 if voxels.seen_from and told is _BY_VIEW else _HELD
     at, slope = stack.at_m.copy(), stack.slope.copy()
     normal, x = np.zeros((6, 6)), np.zeros(6)
     scale, P, U, G = fit_axis(
-        voxels.xyz_m, ray, at, slope, stack.radius_m, reach * _margin_m(stack, config), stack.z_low_m - 0.15,
-        stack.z_high_m + 0.15, start, _CORRELATED, config.range_noise_per_m, config.surface_noise_m, prior, normal, x,
+        voxels.xyz_m, voxels.view, voxels.origins_m, told, at, slope, stack.radius_m, reach * _margin_m(stack, config),
+        stack.z_low_m - 0.15, stack.z_high_m + 0.15, start, _CORRELATED, held, config.range_noise_per_m,
+        config.surface_noise_m, prior, normal, x,
     )  # fmt: skip
     return None if scale < 0.0 else _Fit(P, U, G, x, float(scale), at, slope, normal)
 
@@ -132,7 +140,7 @@ def _as_faced(voxels: Voxels, stack: Stack, found: _Fit, config: DetectorConfig)
         if seen is None:
             return None
         range_m = seen.range_m(config.range_noise_per_m, config.surface_noise_m)
-        ray = np.tile(np.array([*(range_m * seen.ray), 0.0]), (len(voxels.xyz_m), 1))
+        ray = np.array([1.0, *(range_m * seen.ray)])
         inferred = replace(stack, range_m=range_m, radius_m=max(float(found.x[4]), stack.radius_m))
         prior = _priors(inferred.radius_m)
         prior[4, 1] = 1.0 / (0.3 * inferred.radius_m + 0.01) ** 2  # the slices' radius is biased
@@ -153,10 +161,9 @@ def fit_from(eye_m: Floats, voxels: Voxels, stack: Stack, config: DetectorConfig
     range_m = float(np.hypot(to[0], to[1]))
     if range_m < 0.4:
         return None
-    ray = np.column_stack([voxels.xyz_m[:, :2] - eye_m, np.zeros(len(voxels.xyz_m))])
     prior = _priors(stack.radius_m)
     prior[4, 1] = 1.0 / (0.3 * stack.radius_m + 0.01) ** 2  # the slices' radius is biased
-    found = _fitted(voxels, ray, replace(stack, range_m=range_m), config, 1.0, prior)
+    found = _fitted(voxels, np.array([2.0, *eye_m]), replace(stack, range_m=range_m), config, 1.0, prior)
     return None if found is None else _measured(found, config)
 
 

@@ -13,14 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.detector.arcs import fit_slices
-from services.detector.band import crop
+from services.detector.band import Band, crop
 from services.detector.candidates import Surroundings, judge
 from services.detector.config import DetectorConfig
 from services.detector.ground import find_ground
 from services.detector.model import DetectionResult, Ground, Views
 from services.detector.stacks import stack_circles
 from services.detector.upright import upright_frame
-from services.detector.voxels import Voxels, slice_clusters
+from services.detector.voxels import slice_clusters
 
 
 @dataclass(slots=True)
@@ -63,13 +63,13 @@ def detect_trees(
     ground = grounded.ground
     watch.lap("ground")
     crop_low = config.crop_low_m if ground.seen else -0.05
-    band = crop(frame, grounded, crop_low, config.crop_high_m, config.look_high_m)
+    band = crop(frame, grounded, views, crop_low, config.crop_high_m, config.look_high_m)
     watch.lap("crop")
     slices = slice_clusters(frame, band, views, config.layer_m, config.link_m, config.voxel_m)
     watch.lap("clusters")
     circles = fit_slices(slices, frame.low, config)
     watch.lap("arcs")
-    span_m = _needed_span_m(slices.voxels, ground, config)
+    span_m = _needed_span_m(band, ground, config)
     min_layers = max(3.0, min(config.min_layers, 0.8 * span_m / slices.layer_m))
     stacks = stack_circles(circles, 0.75 * min_layers, config)
     watch.lap("stacks")
@@ -85,9 +85,9 @@ def _empty(points_m: NDArray[np.floating], up: tuple[float, float, float]) -> De
     return DetectionResult((), (), ground, up, 0, len(points_m))
 
 
-def _needed_span_m(voxels: Voxels, ground: Ground, config: DetectorConfig) -> float:
+def _needed_span_m(band: Band, ground: Ground, config: DetectorConfig) -> float:
     """Return the height over which a trunk must be seen: less where the whole cloud is a thin slab."""
-    if ground.seen or len(voxels.height_m) == 0:
+    if ground.seen or len(band.xyz_m) == 0:
         return config.min_span_m
-    extent = float(np.ptp(voxels.height_m))
+    extent = band.span_m[1] - band.span_m[0]
     return float(min(config.min_span_m, max(0.2, 0.7 * extent)))

@@ -28,8 +28,9 @@ class Views:
 
     @classmethod
     def of_points(cls, origins_m: Floats) -> Views:
-        """Return views from one origin per point, (N, 3)."""
-        return cls(np.arange(len(origins_m), dtype=np.int32), np.ascontiguousarray(origins_m, dtype=np.float64))
+        """Return views from one origin per point, (N, 3); points of equal origin share a view."""
+        origins, index = np.unique(np.asarray(origins_m, dtype=np.float64), axis=0, return_inverse=True)
+        return cls(index.reshape(-1).astype(np.int32), np.ascontiguousarray(origins))
 
 
 @dataclass(frozen=True, slots=True)

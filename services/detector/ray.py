@@ -57,6 +57,6 @@ def point_sigma(s_share: float, range_m: float, ray: bool, k_range: float, surfa
     """
     if not ray:
         return surface
-    cosine = np.sqrt(max(1.0 - s_share * s_share, 0.10))
+    cosine2 = max(1.0 - s_share * s_share, 0.10)
     depth = k_range * range_m * range_m
-    return np.sqrt(depth * depth + (surface / cosine) ** 2)
+    return np.sqrt(depth * depth + surface * surface / cosine2)

@@ -85,9 +85,10 @@ def _one_slice(noise_m: float, seed: int, rays: bool) -> float:
         xyz.append(np.hstack([p, z]))
     points = np.concatenate(xyz)
     frame = upright_frame(points, (0.0, 0.0, 1.0))
-    index, none = np.arange(len(points), dtype=np.int32), np.zeros((0, 3), dtype=np.float32)
     views = Views.of_points(points * [0.0, 0.0, 1.0]) if rays else None
-    slices = slice_clusters(frame, Band(index, points[:, 2].astype(np.float32), none), views, 0.1, 0.05, 0.001)
+    seen_by = views.index if views is not None else np.zeros(0, dtype=np.int32)
+    band = Band(frame.xyz_m, seen_by, (0.0, 1.5), np.zeros((0, 3), dtype=np.float32))
+    slices = slice_clusters(frame, band, views, 0.1, 0.05, 0.001)
     config = DetectorConfig(range_noise_per_m=noise_m / 16.0, surface_noise_m=0.004)
     circles = fit_slices(slices, frame.low, config)
     assert len(circles.layer) >= layers // 2

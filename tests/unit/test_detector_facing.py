@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from services.detector.axis_fit import to_upright
 from services.detector.config import DetectorConfig
-from services.detector.cylinder_kernels import to_upright
 from services.detector.detect import detect_trees
 from services.detector.facing import common_eye, facing
 from tests.unit.detector_clouds import Floats, ground, trunk, with_depth_noise
