@@ -39,11 +39,13 @@ _DOCK_WITHIN_S = 400.0
 _AGAIN_WITHIN_S = 30.0
 
 
-def split_rig(hosts: Hosts, seed: int, folder: Path, *, real: bool = False) -> Rig:
-    """Return the system over the hosts; ``real``: rendered, with no stand-ins."""
+def split_rig(hosts: Hosts, seed: int, folder: Path, *, real: bool = False, waits: bool = True) -> Rig:
+    """Return the system over the hosts; ``real``: rendered, with no stand-ins; ``waits``: time waits for who is silent."""
     base = flight_config(seed, folder)
-    flight = base.simulator.flight.model_copy(update={"max_speed": 1.0, "hung_after_s": 0.3})
-    simulator = base.simulator.model_copy(update={"flight": flight})
+    simulator = base.simulator
+    if not waits:
+        flight = simulator.flight.model_copy(update={"max_speed": 1.0, "hung_after_s": 0.3})
+        simulator = simulator.model_copy(update={"flight": flight})
     if real:
         simulator = TreedockConfig().simulator.model_copy(update={
             "seed": seed, "reduced": True, "px4": base.simulator.px4,
@@ -154,7 +156,7 @@ def cut(
     """Pull a machine's cable at random moments; for good (until the aircraft is down) where ``for_s`` is infinite."""
     failed: list[str] = []
     seen: list[Seen] = []
-    with split_rig(hosts, seed, folder) as rig:
+    with split_rig(hosts, seed, folder, waits=False) as rig:
         flights = Flights(rig, np.random.default_rng([seed, ord(host)]), tell)
 
         def pull() -> Back:
