@@ -74,7 +74,8 @@ class Chronicle:
         story = self._story
         last = story.states[-1] if story.states else None
         if last is not None and last.state in ENDS and state.state not in ENDS:
-            story.states, story.targets, last = [], [], None  # another mission in the same map
+            # another mission in the same map: its path is its own, and those of a whole day would be too many
+            story.states, story.targets, story.trajectory, last = [], [], [], None
         if last is not None and (last.state, last.reason) == (state.state, state.reason):
             return False
         if len(story.states) < _MOST_STATES:

@@ -167,6 +167,8 @@ class Flight:
         """Count touches of things, and of the ground where it was not meant."""
         x, y, z = (float(v) for v in T_world_camera[:3, 3])
         self._flown = self._flown or z - self.stage.scene.ground.at(x, y) > _FLOWN_M
+        if self.px4.on_ground and not self.px4.armed:
+            self._flown = False  # armed once more it stands, and has not come down
         bumped = self._flown and self.px4.on_ground and self.px4.armed and self.px4.mode not in _LANDING
         self.stage.touches.update(self.stage.world.clearance_of_things(T_world_camera[:3, 3]), bumped=bumped)
 

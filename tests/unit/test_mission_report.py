@@ -151,6 +151,21 @@ def test_another_map_begins_the_path_anew() -> None:
     assert [T[0, 3] for _, T in chronicle.story().trajectory] == [9.0]
 
 
+def test_another_mission_begins_the_path_anew_and_an_hour_of_them_is_not_piled_up() -> None:
+    chronicle = Chronicle("uav1")
+    for mission in range(3):
+        for k in range(50):
+            chronicle.hear(pose(100.0 * mission + 0.1 * k, 10.0 * mission + 0.1 * k))
+        for told in MISSION:
+            chronicle.hear(told.model_copy(update={"stamp_ns": told.stamp_ns + 100 * mission * SECOND}))
+        if mission == 0:
+            begun = len(chronicle.story().trajectory)
+    chronicle.hear(state("preflight", "mission 4 ordered", 300.0))
+    chronicle.hear(pose(301.0, 7.0))
+    assert begun > 40
+    assert [T[0, 3] for _, T in chronicle.story().trajectory] == [7.0]
+
+
 def test_thinning_keeps_shape_and_ends() -> None:
     line = [(n, np.eye(4)) for n in range(1000)]
     for n, T in line:
