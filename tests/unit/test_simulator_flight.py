@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+from types import SimpleNamespace
 from typing import cast
 
+import numpy as np
 import pytest
 
 from schemas.camera import RgbdFrame
@@ -24,12 +26,18 @@ from schemas.trees import Target
 from schemas.vehicle import VehicleState
 from services.common.config import TreedockConfig
 from services.common.context import Context
+from services.common.geometry import level_camera
 from services.common.memory import Hub
-from services.simulator.config import FlightConfig, SimulatorConfig
+from services.simulator.camera import SimulatedCamera
+from services.simulator.catalogue import scene_by_name
+from services.simulator.config import FlightConfig, SensorConfig, SimulatorConfig
 from services.simulator.flight import Flight
 from services.simulator.followers import Follower, Followers
 from services.simulator.px4.config import Px4Config
+from services.simulator.px4.modes import NavState
+from services.simulator.px4.simulated import SimulatedPx4
 from services.simulator.touch import Touches
+from services.simulator.world import World
 
 
 class Lives:
@@ -248,3 +256,30 @@ def test_frames_are_lost_as_asked_and_the_same_each_time() -> None:
         assert set(gaps) == ({1} if config is CONFIG else set(gaps) & {1, 2, 3, 4, 5})
     assert 0.5 * len(stamps[0]) < len(stamps[1]) < 0.9 * len(stamps[0])
     assert stamps[1] == stamps[2]
+
+
+def test_an_aircraft_that_is_armed_once_more_has_not_come_down(bench: Bench) -> None:
+    flight, T = bench.flight, np.eye(4)
+    T[:3, 3] = (0.0, 0.0, flight.stage.scene.ground.at(0.0, 0.0) + 2.0)
+    flight.px4 = cast(SimulatedPx4, SimpleNamespace(on_ground=False, armed=True, mode=NavState.OFFBOARD))
+    flight._feel(T)
+    flight.px4 = cast(SimulatedPx4, SimpleNamespace(on_ground=True, armed=False, mode=NavState.LAND))
+    T[2, 3] -= 1.9
+    flight._feel(T)
+    flight.px4 = cast(SimulatedPx4, SimpleNamespace(on_ground=True, armed=True, mode=NavState.OFFBOARD))
+    flight._feel(T)
+    assert flight.stage.touches.count == 0
+
+
+def test_small_pictures_show_the_same_depth() -> None:
+    scene = scene_by_name("single-01")
+    exact = SensorConfig(disparity_sigma_px=0.0)
+    full, small = (SimulatedCamera(World(scene), exact, small=small) for small in (False, True))
+    T = level_camera([0.0, 0.0, 1.5 + scene.ground.at(0.0, 0.0)], scene.start_yaw_rad)
+    here, there = full.look(T, 0).depth, small.look(T, 0).depth
+    assert there.shape == (240, 320)
+    assert small.intrinsics.width == 320
+    both = (here[4::8, 4::8] > 0) & (there[2::4, 2::4] > 0)
+    off = np.abs(here[4::8, 4::8].astype(float) - there[2::4, 2::4])[both]
+    assert both.sum() > 500
+    assert np.median(off) < 40.0

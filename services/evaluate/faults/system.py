@@ -9,6 +9,7 @@ from services.common.config import TreedockConfig
 from services.common.session import free_port
 from services.simulator.config import FlightConfig, SensorConfig
 from services.simulator.px4.config import LinkConfig, Px4Config
+from services.station.launch import with_station
 
 SPEED = 4.0
 """Simulated seconds a second at most; a busy machine is slower, and so is a flight in which somebody is missing."""
@@ -28,7 +29,7 @@ def flight_config(seed: int, folder: Path, *, speed: float = SPEED) -> TreedockC
         # a battery for a day: what is flown here is faults, not endurance
         "px4": Px4Config(links=(LinkConfig(local_port=0, remote_port=port),), battery_endurance_s=1e6),
     })  # fmt: skip
-    return base.model_copy(update={
+    tree = base.model_copy(update={
         "clock": "sim",
         "router": base.router.model_copy(update={"port": free_port(base.router.host)}),
         "camera": base.camera.model_copy(update={"source": "sim"}),
@@ -38,6 +39,7 @@ def flight_config(seed: int, folder: Path, *, speed: float = SPEED) -> TreedockC
         "recorder": base.recorder.model_copy(update={"folder": folder / "recordings", "reserve_mb": 0}),
         "simulator": simulator,
     })  # fmt: skip
+    return with_station(tree, folder)
 
 
 def _free_udp_port() -> int:
