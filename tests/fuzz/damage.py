@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from hypothesis import strategies as st
 
-CASES = int(os.environ.get("TREEDOCK_FUZZ", "0")) or 60
+CASES = int(os.environ.get("TREEDOCK_FUZZ", "0")) or 25
 """Cases per target: short in CI; ``TREEDOCK_FUZZ=20000 pytest tests/fuzz`` for a night."""
 
 Edit = tuple[str, float, int, bytes]

@@ -1,6 +1,6 @@
 """Whatever bytes come from outside, each reader gives a value or its own error: never another, never a crash.
 
-60 cases a target here; ``TREEDOCK_FUZZ=20000 pytest tests/fuzz`` for many (docs/threat-model.md says how many were run).
+25 cases a target here; ``TREEDOCK_FUZZ=20000 pytest tests/fuzz`` for many (docs/threat-model.md says how many were run).
 """
 
 from __future__ import annotations

@@ -106,10 +106,9 @@ def test_budgets_are_of_what_the_units_run() -> None:
     assert all(unit.memory_mb > 1.2 * BUDGETS[unit.name].pss_mb for unit in units.UNITS if not unit.ground)
 
 
-@pytest.mark.parametrize("shared", [True, False])
-def test_frames_reach_all_three_listeners_either_way(*, shared: bool) -> None:
-    way = measure(shared=shared, size=(160, 120), seconds=1.0)
-    assert way.shared == shared
+def test_frames_reach_all_three_listeners_without_shared_memory_too() -> None:
+    way = measure(shared=False, size=(160, 120), seconds=1.0)
+    assert not way.shared
     assert 0.0 < way.p50_ms <= way.p99_ms
     assert way.lost <= 5
 
