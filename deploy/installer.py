@@ -24,6 +24,8 @@ USER = "treedock"
 UNIT_FOLDER = "etc/systemd/system"
 CONFIG = "etc/treedock/10-treedock.toml"
 COMMAND = "usr/local/bin/treedock"
+BOOTED = Path("/run/systemd/system")
+"""There while systemd runs this machine (man sd_booted)."""
 RULES = "etc/udev/rules.d/60-treedock.rules"
 _MIN_PYTHON = (3, 11)
 
@@ -123,11 +125,13 @@ def _activation(options: Options) -> Iterator[Action]:
         ("runuser", "-u", USER, "--", "env", cache, f"{options.prefix}/bin/treedock", "warm"),
         "compile the kernels once, so that services start at once",
     )
-    yield Run(("systemctl", "daemon-reload"), "read the units")
+    # not in an image that is being made: its units are read when it boots
+    yield Run(("systemctl", "daemon-reload"), "read the units", needed=BOOTED.is_dir())
     yield Run(("udevadm", "control", "--reload"), "read the device rules", may_fail=True)
     target = "treedock-station.target" if options.role == "station" else "treedock.target"
     if options.enable:
-        yield Run(("systemctl", "enable", "--now", target), "start now and at every boot")
+        now = ("--now",) if BOOTED.is_dir() else ()
+        yield Run(("systemctl", "enable", *now, target), "start now and at every boot")
 
 
 def removal(options: Options) -> Iterator[Action]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from services.detector.refine.config import FilterConfig
+from services.detector.refine.filterpy_start import kalman_filter
 
 _MIN_RANGE_M = 0.3
 
@@ -19,9 +20,7 @@ class Filter1D:
     """
 
     def __init__(self, value: float, variance: float, rate_variance: float) -> None:
-        from filterpy.kalman import KalmanFilter
-
-        self._kalman: Any = KalmanFilter(dim_x=2, dim_z=1)
+        self._kalman: Any = kalman_filter()(dim_x=2, dim_z=1)
         self._kalman.x = np.array([[value], [0.0]])
         self._kalman.P = np.diag([variance, rate_variance])
         self._kalman.H = np.array([[1.0, 0.0]])
