@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import os
 import re
+import resource
 import shutil
 import subprocess
 import sys
@@ -24,10 +25,12 @@ USER = "treedock"
 UNIT_FOLDER = "etc/systemd/system"
 CONFIG = "etc/treedock/10-treedock.toml"
 COMMAND = "usr/local/bin/treedock"
+MEMORY_LOCK = f"{UNIT_FOLDER}/treedock-.service.d/10-memory-lock.conf"
 BOOTED = Path("/run/systemd/system")
 """There while systemd runs this machine (man sd_booted)."""
 RULES = "etc/udev/rules.d/60-treedock.rules"
 _MIN_PYTHON = (3, 11)
+_CAP_IPC_LOCK = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -68,12 +71,24 @@ def installation(options: Options) -> Iterator[Action]:
     yield Write(options.at(RULES), (SOURCE / "deploy/udev/60-treedock.rules").read_text())
     for name, text in units.files(options.prefix).items():
         yield Write(options.at(f"{UNIT_FOLDER}/{name}"), text)
+    if options.live and needs_capability():
+        yield Write(options.at(MEMORY_LOCK), units.MEMORY_LOCK)
     operations = SOURCE / "docs/operations.md"
     if operations.is_file():
         yield Write(options.at(f"{options.prefix}/share/doc/treedock/operations.md"), operations.read_text())
     yield Link(options.at(COMMAND), f"{options.prefix}/bin/treedock")
     if options.live:
         yield from _activation(options)
+
+
+def needs_capability(status: Path = Path("/proc/self/status")) -> bool:
+    """Return whether locked memory is to be had by CAP_IPC_LOCK alone: the limit cannot be raised, as in containers."""
+    try:
+        resource.setrlimit(resource.RLIMIT_MEMLOCK, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    except (ValueError, OSError):
+        bounding = next(line.split()[1] for line in status.read_text().splitlines() if line.startswith("CapBnd:"))
+        return bool(int(bounding, 16) & _CAP_IPC_LOCK)
+    return False
 
 
 def _user() -> Iterator[Action]:
@@ -143,6 +158,7 @@ def removal(options: Options) -> Iterator[Action]:
         yield Run(("systemctl", "stop", *names), "stop", may_fail=True)
     for name in units.files():
         yield Remove(options.at(f"{UNIT_FOLDER}/{name}"))
+    yield Remove(options.at(MEMORY_LOCK))
     yield Remove(options.at(RULES))
     command = options.at(COMMAND)
     if command.is_symlink() and str(command.readlink()) == f"{options.prefix}/bin/treedock":

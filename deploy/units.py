@@ -115,7 +115,9 @@ Group=treedock
 {groups}Environment=NUMBA_CACHE_DIR=/var/cache/treedock/numba OMP_NUM_THREADS=1 HOME=/var/lib/treedock
 WorkingDirectory=/var/lib/treedock
 StateDirectory={unit.state}
+StateDirectoryMode=0750
 CacheDirectory=treedock
+CacheDirectoryMode=0750
 # READY comes after the bus is joined and the kernels are loaded; on a machine whose cache is cold that takes minutes
 TimeoutStartSec=300
 # kicked from the work loop once a second: a hung handler is a hung service
@@ -161,6 +163,16 @@ def files(prefix: str = PREFIX) -> dict[str, str]:
     found["treedock.target"] = target_text(ground=False)
     found["treedock-station.target"] = target_text(ground=True)
     return found
+
+
+MEMORY_LOCK = """\
+# made by deploy/install: this machine (a container) does not let LimitMEMLOCK be raised, and without locked memory camera
+# frames are copied; the one capability cures it
+[Service]
+CapabilityBoundingSet=CAP_IPC_LOCK
+AmbientCapabilities=CAP_IPC_LOCK
+"""
+"""A drop-in for all services of a machine that needs it."""
 
 
 def main() -> int:

@@ -7,6 +7,7 @@ import ctypes
 import gc
 import os
 import signal
+import tempfile
 import threading
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,13 +25,22 @@ def prepare_process() -> None:
 
     The garbage collector looks seldom until ``started``.
     """
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "treedock" / "numba"
     # beside the code the cache would need write access that a deployment does not give
-    os.environ.setdefault("NUMBA_CACHE_DIR", str(cache))
+    os.environ.setdefault("NUMBA_CACHE_DIR", str(_kernel_cache()))
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
         os.environ.setdefault(name, "1")
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     gc.set_threshold(_STARTING_OBJECTS)
+
+
+def _kernel_cache() -> Path:
+    """Return a folder that this user can write: of somebody without a home a temporary one."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "treedock" / "numba"
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return Path(tempfile.gettempdir()) / f"treedock-{os.getuid()}" / "numba"
+    return cache
 
 
 def started() -> None:

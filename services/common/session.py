@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
-import resource
 import socket
 import threading
 import time
@@ -16,6 +14,7 @@ from typing import TYPE_CHECKING
 import zenoh
 
 from services.common.errors import InputError
+from services.common.memlock import lockable_bytes, too_little
 
 if TYPE_CHECKING:
     from services.common.config import TreedockConfig
@@ -31,7 +30,6 @@ _QUEUE_BATCHES = 16
 """Sent messages that may wait per priority, the most Zenoh allows. Of 420 small messages in bursts of seven, up to 6
 were lost per subscriber on a loaded two-core machine with the default of 2, none with 16."""
 _TELL_AFTER_S = 2.0
-_ENOUGH_LOCKED_BYTES = 64 * 1024 * 1024
 
 
 def client_config(endpoint: str, secured: Mapping[str, object] | None = None) -> zenoh.Config:
@@ -180,16 +178,14 @@ def free_port(host: str = "127.0.0.1") -> int:
 
 
 def shared_memory_note() -> str:
-    """Return what keeps Zenoh's shared memory off on this machine, or an empty text.
+    """Return what keeps Zenoh's shared memory off in this process, or an empty text.
 
-    Its segments are locked in memory; where the limit is too small it is silently off and big frames cost four times
-    as much.
+    Its segments are locked in memory; where the limit is too small it is silently off and big frames cost four times as much.
     """
-    if os.geteuid() == 0:
-        return ""
-    soft, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
-    if soft in {resource.RLIM_INFINITY} or soft >= _ENOUGH_LOCKED_BYTES:
+    lockable = lockable_bytes()
+    if lockable is None or not too_little(lockable):
         return ""
     return (
-        f"shared memory is off: {soft // 1024} KB may be locked; raise it (ulimit -l, LimitMEMLOCK=) for cheap frames"
+        f"shared memory is off: {lockable // 1024} KB may be locked; raise it (ulimit -l, LimitMEMLOCK=), or give "
+        "CAP_IPC_LOCK, for cheap frames"
     )

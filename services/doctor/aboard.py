@@ -51,17 +51,20 @@ def state_of(service: ServiceFact) -> Finding:
 def versions(services: Sequence[ServiceFact], ours: str) -> list[Finding]:
     """Compare what runs at the other ends with what asks."""
     do = "install the same version on both machines (sudo deploy/install) and restart the services"
-    told = [service for service in services if service.version]
+    by_version: dict[str, list[str]] = {}
+    for service in services:
+        if service.version:
+            by_version.setdefault(service.version, []).append(service.name)
     found = []
-    for service in told:
-        words = f"{service.name} runs treedock {service.version}, this is {ours}"
-        if not same_contract(service.version, ours):
-            found.append(Finding("versions", "fail", f"{words}: they may refuse each other's messages", do))
-        elif service.version != ours:
+    for version, names in sorted(by_version.items()):
+        words = f"{', '.join(names)}: treedock {version}, this is {ours}"
+        if not same_contract(version, ours):
+            found.append(Finding("versions", "fail", f"{words}; they may refuse each other's messages", do))
+        elif version != ours:
             found.append(Finding("versions", "warn", words, do))
-    if found or not told:
+    if found or not by_version:
         return found
-    return [Finding("versions", "ok", f"{len(told)} services run treedock {ours}, as this command does")]
+    return [Finding("versions", "ok", f"treedock {ours} everywhere")]
 
 
 def clocks(services: Sequence[ServiceFact]) -> list[Finding]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import datetime as dt
-import os
-import resource
 import shutil
 import stat
 import subprocess
@@ -16,8 +14,9 @@ from typing import TYPE_CHECKING
 from schemas.health import Health
 from schemas.topics import HEALTH, VEHICLE_STATE
 from schemas.vehicle import VehicleState
-from services.camera.sources.camera_json import calibrated_on
+from services.camera.calibrated import calibrated_on
 from services.common.errors import InputError
+from services.common.memlock import lockable_bytes
 from services.common.version import running_version
 from services.doctor.model import Facts, ServiceFact, VehicleFact
 
@@ -47,7 +46,7 @@ def gather(config: TreedockConfig) -> Facts:
         encrypted=folder is not None,
         reachable_from_outside=_from_outside(config.router.listen_host or config.router.host),
         clock_synchronised=_synchronised(),
-        locked_limit_bytes=resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] if os.geteuid() else -1,
+        lockable_bytes=lockable_bytes(),
         shm_free_bytes=_free(Path("/dev/shm")),
         disk_free_bytes=_free(_nearest(config.recorder.folder)),
         recordings_cut=_cut(config.recorder.folder),
@@ -124,19 +123,29 @@ def _ahead_s(health: Health) -> float | None:
 
 
 def _service(health: Health, heard_s: float) -> ServiceFact:
+    age_s = time.monotonic() - heard_s
+    process = _process_of(health)
     return ServiceFact(
-        health.service, health.state, health.pid, health.note, time.monotonic() - heard_s, health.rates_hz,
-        _locked_bytes(health), 1e-9 * health.stamp_ns - (time.time() - (time.monotonic() - heard_s)), health.version,
-        _ahead_s(health),
+        health.service, health.state, health.pid, health.note, age_s, health.rates_hz,
+        locked_bytes=None if process is None else _locked_bytes(process),
+        lockable_bytes=None if process is None else lockable_bytes(health.pid),
+        clock_offset_s=1e-9 * health.stamp_ns - (time.time() - age_s), version=health.version, clock_ahead_s=_ahead_s(health),
     )  # fmt: skip
 
 
-def _locked_bytes(health: Health) -> int | None:
-    """Return VmLck of a service on this machine: what the limit says is not always what is in force."""
+def _process_of(health: Health) -> Path | None:
+    """Return a service's folder in /proc; None for one of another machine, whose number means somebody else here."""
     process = Path(f"/proc/{health.pid}")
     try:
-        if health.service.encode() not in (process / "cmdline").read_bytes().split(b"\0"):
-            return None  # of another machine, whose number means somebody else here
+        ours = health.service.encode() in (process / "cmdline").read_bytes().split(b"\0")
+    except OSError:
+        return None
+    return process if ours else None
+
+
+def _locked_bytes(process: Path) -> int | None:
+    """Return VmLck: what the limit says is not always what is in force."""
+    try:
         lines = (process / "status").read_text().splitlines()
     except OSError:
         return None

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from schemas.topics import CAMERA_RGBD
+from services.common.memlock import too_little
 from services.doctor.aboard import aboard
 from services.doctor.model import Facts, Finding
 
@@ -13,6 +15,8 @@ _GB = 1_000_000_000
 DISK_WARN_BYTES, DISK_FAIL_BYTES = 5 * _GB, _GB // 2
 SHM_WARN_BYTES = 256_000_000
 USB3_MBIT = 5000.0
+LEAST_LOCKED_BYTES = 1_000_000
+"""A frame of 640x480 takes 1.5 MB; a session at rest locks some 20 KB."""
 
 
 def judge(facts: Facts) -> list[Finding]:
@@ -91,19 +95,35 @@ def _clock(f: Facts) -> list[Finding]:
 
 
 def _memory(f: Facts) -> list[Finding]:
-    found = []
     if f.shm_free_bytes is not None and f.shm_free_bytes < SHM_WARN_BYTES:
         text = f"/dev/shm has {f.shm_free_bytes // 1_000_000} MB left: camera frames will not fit"
-        found.append(Finding("shared memory", "fail", text, "free it, or mount it larger (size= in /etc/fstab)"))
-    camera = next((s for s in f.services if s.name == "camera"), None)
-    cure = "LimitMEMLOCK=infinity in the unit; where that is not in force (containers), CAP_IPC_LOCK"
-    if camera is not None and camera.locked_bytes == 0:
-        words = "the camera's process holds no locked memory: shared memory is off and frames cost four times as much"
-        found.append(Finding("shared memory", "warn", words, cure))
-    elif camera is None and f.locked_limit_bytes is not None and 0 <= f.locked_limit_bytes < 64_000_000:
-        words = f"this session may lock {f.locked_limit_bytes // 1000} KB: started from here, frames would be copied"
-        found.append(Finding("shared memory", "warn", words, cure))
-    return found or [Finding("shared memory", "ok", "in force" if camera and camera.locked_bytes else "available")]
+        return [Finding("shared memory", "fail", text, "free it, or mount it larger (size= in /etc/fstab)")]
+    here = [service for service in f.services if service.lockable_bytes is not None]
+    poor = [service for service in here if too_little(service.lockable_bytes)]
+    cure = (
+        "LimitMEMLOCK=infinity in the unit; where that is not in force (containers), CAP_IPC_LOCK: sudo deploy/install"
+    )
+    if poor:
+        least = min(service.lockable_bytes or 0 for service in poor) // 1000
+        names = ", ".join(service.name for service in poor)
+        words = f"{names} may lock only {least} KB: shared memory is off there, frames cost four times as much"
+        return [Finding("shared memory", "warn", words, cure)]
+    if not here and too_little(f.lockable_bytes):
+        words = f"this session may lock {(f.lockable_bytes or 0) // 1000} KB: started from here, frames would be copied"
+        return [Finding("shared memory", "warn", words, cure)]
+    return _frames_shared(f, cure)
+
+
+def _frames_shared(f: Facts, cure: str) -> list[Finding]:
+    """Look at VmLck of a camera that sends: the frames lie there, or shared memory is not in force."""
+    camera = next((service for service in f.services if service.name == "camera"), None)
+    if camera is None or camera.locked_bytes is None or camera.rates_hz.get(CAMERA_RGBD.name, 0.0) < 1.0:
+        return [Finding("shared memory", "ok", "may be used; whether it is shows when frames flow")]
+    megabytes = camera.locked_bytes / 1e6
+    if camera.locked_bytes < LEAST_LOCKED_BYTES:
+        words = f"frames flow and the camera's process locks {megabytes:.1f} MB (VmLck): they are copied"
+        return [Finding("shared memory", "warn", words, cure)]
+    return [Finding("shared memory", "ok", f"in force: the camera's process locks {megabytes:.0f} MB (VmLck)")]
 
 
 def _disk(f: Facts) -> list[Finding]:

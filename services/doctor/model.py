@@ -32,6 +32,8 @@ class ServiceFact:
     rates_hz: Mapping[str, float]
     locked_bytes: int | None = None
     """VmLck of its process on this machine; None: another machine's, or unreadable."""
+    lockable_bytes: int | None = None
+    """What that process may lock, as really in force; -1: any amount."""
     clock_offset_s: float | None = None
     """Its stamps against this machine's clock; None: not told."""
     version: str = ""
@@ -75,8 +77,8 @@ class Facts:
     encrypted: bool = False
     reachable_from_outside: bool = False
     clock_synchronised: bool | None = None
-    locked_limit_bytes: int | None = None
-    """RLIMIT_MEMLOCK of this session; -1: unlimited."""
+    lockable_bytes: int | None = None
+    """What this session may lock; -1: any amount."""
     shm_free_bytes: int | None = None
     disk_free_bytes: int | None = None
     recordings_cut: Sequence[str] = ()

@@ -182,6 +182,30 @@ def test_a_python_that_the_services_may_not_read_is_known(python: str, home: str
     assert installer.home_of(Path(python)) == home
 
 
+@pytest.mark.parametrize(("bounding", "needed"), [("0000000000004000", True), ("0000000000000000", False)])
+def test_where_the_limit_cannot_be_raised_the_capability_is_taken_if_there_is_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, bounding: str, needed: bool
+) -> None:
+    def refused(*_: object) -> None:
+        raise ValueError("not allowed to raise maximum limit")
+
+    monkeypatch.setattr("resource.setrlimit", refused)
+    (tmp_path / "status").write_text(f"CapBnd:\t{bounding}\n")
+    assert installer.needs_capability(tmp_path / "status") == needed
+    monkeypatch.setattr("resource.setrlimit", lambda *_: None)
+    assert not installer.needs_capability(tmp_path / "status")
+
+
+@pytest.mark.skipif(not HAS_SYSTEMD, reason="systemd-analyze is not installed")
+def test_exposure_stays_low_with_the_capability(tmp_path: Path) -> None:
+    for unit in units.UNITS:
+        text = units.service_text(unit) + units.MEMORY_LOCK
+        path = tmp_path / f"treedock-{unit.name}.service"
+        path.write_text(text)
+        command = ["systemd-analyze", "security", "--offline=yes", "--threshold=20", "--no-pager", str(path)]
+        assert subprocess.run(command, capture_output=True, check=False).returncode == 0, unit.name
+
+
 def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert installer.main(["--root", str(tmp_path / "new"), "--dry-run"]) == 0
     assert not (tmp_path / "new").exists()

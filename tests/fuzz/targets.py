@@ -13,11 +13,12 @@ from pymavlink.dialects.v20 import common as mav
 
 from schemas.codec import Wire, decode, encode
 from schemas.envelope import DecodeError
+from services.camera.calibrated import calibrated_on
 from services.camera.codecs import FrameError, decode_colour_image, decode_depth
 from services.camera.config import CameraConfig
 from services.camera.sources import open_recording
 from services.camera.sources.accelerometer import Accelerometer
-from services.camera.sources.camera_json import calibrated_on, read_camera
+from services.camera.sources.camera_json import read_camera
 from services.common.config_loader import load
 from services.common.errors import InputError
 from services.detector.readers import read_cloud

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import logging
+import os
 import socket
 import threading
 import time
@@ -22,7 +24,7 @@ from services.common.health import HealthReporter
 from services.common.inbox import Inbox
 from services.common.logging import Throttle, set_up
 from services.common.memory import Hub
-from services.common.process import give_way
+from services.common.process import give_way, prepare_process
 from services.common.session import free_port, port_is_free, split_endpoint
 
 
@@ -175,3 +177,13 @@ def test_a_sandbox_that_forbids_priorities_stops_nobody(monkeypatch: pytest.Monk
 
     monkeypatch.setattr("os.setpriority", forbidden)
     give_way(5)
+
+
+def test_somebody_without_a_home_has_kernels_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file/cache"))
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    before = gc.get_threshold()
+    prepare_process()
+    gc.set_threshold(*before)
+    assert str(tmp_path) not in os.environ["NUMBA_CACHE_DIR"]

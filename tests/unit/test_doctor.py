@@ -27,13 +27,14 @@ CAMERA = ServiceFact(
     0.2,
     {"camera/rgbd": 15.0},
     locked_bytes=50_000_000,
+    lockable_bytes=-1,
     clock_offset_s=0.001,
     version="0.1.0+same",
 )
 SLAM = ServiceFact("slam", "ready", 11, "", 0.2, {"slam/pose": 15.0}, clock_offset_s=0.001)
 SOUND = Facts(
     router="tcp/127.0.0.1:7447", wanted_router="tcp/127.0.0.1:7447", services=(CAMERA, SLAM),
-    units={"treedock-slam.service": "active"}, clock_synchronised=True, locked_limit_bytes=-1, shm_free_bytes=10**10,
+    units={"treedock-slam.service": "active"}, clock_synchronised=True, lockable_bytes=-1, shm_free_bytes=10**10,
     version="0.1.0+same", disk_free_bytes=10**11, camera="realsense: 4 video devices", source="realsense", calibration_days=20.0,
 )  # fmt: skip
 PX4 = ServiceFact("autopilot", "ready", 12, "", 0.2, {"vehicle/state": 20.0})
@@ -58,11 +59,12 @@ def test_a_sound_machine_has_no_trouble() -> None:
         (replace(SOUND, services=(replace(SLAM, age_s=9.0),)), "slam", "fail", "silent"),
         (replace(SOUND, services=(replace(SLAM, state="degraded", note="lost"),)), "slam", "warn", "lost"),
         (replace(SOUND, services=(replace(SLAM, rates_hz={"slam/pose": 4.0}),)), "slam/pose", "warn", "4.0 Hz, 15"),
-        (replace(SOUND, services=(replace(CAMERA, locked_bytes=0),)), "shared memory", "warn", "shared memory is off"),
+        (replace(SOUND, services=(replace(CAMERA, locked_bytes=24_000),)), "shared memory", "warn", "are copied"),
+        (replace(SOUND, services=(replace(CAMERA, lockable_bytes=8_000_000),)), "shared memory", "warn", "8000 KB"),
         (replace(SOUND, services=(replace(SLAM, clock_offset_s=0.2),)), "clock", "warn", "+200 ms"),
         (replace(SOUND, clock_synchronised=False), "clock", "warn", "not synchronised"),
         (replace(SOUND, shm_free_bytes=10**6), "shared memory", "fail", "/dev/shm"),
-        (replace(SOUND, services=(), locked_limit_bytes=8_000_000), "shared memory", "warn", "8000 KB"),
+        (replace(SOUND, services=(), lockable_bytes=8_000_000), "shared memory", "warn", "8000 KB"),
         (replace(SOUND, disk_free_bytes=10**8), "disk", "fail", "0.1 GB"),
         (replace(SOUND, disk_free_bytes=2 * 10**9), "disk", "warn", "2.0 GB"),
         (replace(SOUND, recordings_cut=("a.mcap",)), "recordings", "warn", "1 recording"),

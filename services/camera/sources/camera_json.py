@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import datetime as dt
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,17 +30,6 @@ class CameraFile:
     """(4, 4): camera points in body (forward, left, up)."""
     T_colour_depth: NDArray[np.float64] | None = None
     """(4, 4), of a depth camera: its points in the colour camera."""
-
-
-def calibrated_on(path: Path) -> dt.date | None:
-    """Return the day on which calibrate wrote ``path``; None when it does not say, or cannot be read.
-
-    The file's own time is no witness: a copy has another.
-    """
-    try:
-        return dt.date.fromisoformat(_object(path)["calibration"]["day"])
-    except (InputError, KeyError, TypeError, ValueError):
-        return None
 
 
 def read_intrinsics(path: Path) -> Intrinsics:
