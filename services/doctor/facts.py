@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import datetime as dt
+import os
 import shutil
 import stat
 import subprocess
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -48,6 +50,7 @@ def gather(config: TreedockConfig) -> Facts:
         clock_synchronised=_synchronised(),
         lockable_bytes=lockable_bytes(),
         shm_free_bytes=_free(Path("/dev/shm")),
+        closed=_closed((folder, config.recorder.folder)),
         disk_free_bytes=_free(_nearest(config.recorder.folder)),
         recordings_cut=_cut(config.recorder.folder),
         camera=camera,
@@ -202,16 +205,36 @@ def _free(path: Path) -> int | None:
 
 
 def _nearest(folder: Path) -> Path:
+    """Return the folder, or the first above it that this user can see."""
     nearest = folder.absolute()
-    while not nearest.exists():
+    while not _seen(nearest):
         nearest = nearest.parent
     return nearest
+
+
+def _seen(path: Path) -> bool:
+    try:
+        return path.exists()
+    except PermissionError:
+        return False
+
+
+def _closed(folders: Iterable[Path | None]) -> list[str]:
+    """Return the folders that are there and that this user may not look into."""
+    return [str(path) for path in folders if path is not None and _hidden(path)]
+
+
+def _hidden(path: Path) -> bool:
+    try:
+        return path.is_dir() and not os.access(path, os.R_OK | os.X_OK)
+    except PermissionError:
+        return True
 
 
 def _cut(folder: Path) -> list[str]:
     from services.recorder.recover import cut_recordings
 
-    return [str(path) for path in cut_recordings(folder)] if folder.is_dir() else []
+    return [] if _hidden(folder) or not folder.is_dir() else [str(path) for path in cut_recordings(folder)]
 
 
 def _camera(source: str) -> tuple[str | None, float | None]:

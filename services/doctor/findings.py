@@ -22,6 +22,7 @@ LEAST_LOCKED_BYTES = 1_000_000
 def judge(facts: Facts) -> list[Finding]:
     """Return the findings, in the order in which a person would go about them."""
     return [
+        *_rights(facts),
         *_units(facts),
         *_bus(facts),
         *_security(facts),
@@ -30,6 +31,11 @@ def judge(facts: Facts) -> list[Finding]:
         *_disk(facts),
         *_camera(facts),
     ]
+
+
+def _rights(f: Facts) -> list[Finding]:
+    words = "this user may not look into "
+    return [Finding("rights", "warn", f"{words}{', '.join(f.closed)}", "sudo treedock doctor")] if f.closed else []
 
 
 def _units(f: Facts) -> list[Finding]:

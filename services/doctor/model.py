@@ -80,6 +80,8 @@ class Facts:
     lockable_bytes: int | None = None
     """What this session may lock; -1: any amount."""
     shm_free_bytes: int | None = None
+    closed: Sequence[str] = ()
+    """Folders that this user may not look into."""
     disk_free_bytes: int | None = None
     recordings_cut: Sequence[str] = ()
     camera: str | None = None

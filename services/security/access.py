@@ -27,6 +27,10 @@ class Rights:
     """Liveliness tokens that it may show."""
     watch: tuple[str, ...]
     """Liveliness tokens that it may see."""
+    wanted: tuple[str, ...]
+    """Of what it publishes: keys in which others may say that they want it, as wide as they may write them."""
+    questions: tuple[str, ...]
+    """Of what it answers: keys in which others may ask, as wide as they may write them."""
 
 
 def may_publish(role: str, topic: Topic) -> bool:
@@ -59,6 +63,8 @@ def rights_of(identity: Identity, topics: Sequence[Topic] = TOPICS) -> Rights:
         answer=tuple(t.key(uav) for t in orders if role in t.consumers) + tuple(t.key(uav) for t in spoken if _kept(t)),
         live=(f"{PREFIX}/{uav}/{LIVE.removesuffix('*')}{role}",) if role not in {READER} else (),
         watch=(f"{PREFIX}/{uav}/{LIVE}",),
+        wanted=tuple(t.key("*") for t in spoken),
+        questions=tuple(t.key("*") for t in (*(t for t in orders if role in t.consumers), *filter(_kept, spoken))),
     )
 
 
@@ -101,13 +107,14 @@ def _rules(name: str, rights: Rights) -> list[Rule]:
     adv = _advanced
     table: tuple[tuple[str, tuple[str, ...], tuple[str, ...], tuple[str, ...]], ...] = (
         ("speak", ("put",), ("ingress",), (*rights.publish, *adv(rights.publish))),
-        ("heard-by", ("declare_subscriber",), ("egress",), (*rights.publish, *adv(rights.publish))),
+        # a station subscribes for all aircraft, the doctor to all health: a publisher that is not told of them sends nothing
+        ("heard-by", ("declare_subscriber",), ("egress",), (*rights.wanted, *adv(rights.wanted))),
         ("hear", ("put",), ("egress",), (*rights.subscribe, *adv(rights.subscribe))),
         ("listen", ("declare_subscriber",), ("ingress",), (*rights.subscribe, *adv(rights.subscribe))),
         ("ask", ("query",), ("ingress",), (*rights.ask, *adv(rights.ask))),
         ("answered", ("reply", "declare_queryable"), ("egress",), (*rights.ask, *adv(rights.ask))),
         ("answer", ("reply", "declare_queryable"), ("ingress",), (*rights.answer, *adv(rights.answer))),
-        ("asked", ("query",), ("egress",), (*rights.answer, *adv(rights.answer))),
+        ("asked", ("query",), ("egress",), (*rights.questions, *adv(rights.questions))),
         ("live", ("liveliness_token",), ("ingress",), (*rights.live, *adv(rights.publish))),
         ("see", ("liveliness_token",), ("egress",), (*rights.watch, *adv(rights.subscribe))),
         (

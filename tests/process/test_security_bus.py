@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from schemas.topics import TOPICS, Delivery
+from schemas.topics import TOPICS, Delivery, Topic
 from services.common.bus import Bus
 from services.common.config import TreedockConfig
 from services.common.context import HealthBook
@@ -68,7 +68,7 @@ def node(folder: Path, port: int, identity: str) -> Iterator[zenoh.Session]:
 
 
 def test_every_identity_does_exactly_what_the_table_says(folder: Path, port: int) -> None:
-    """All nodes at once: each puts its name on every key and listens to every key."""
+    """All nodes at once: each puts its name on every key, declared before and undeclared, and listens to every key."""
     streams = [t for t in TOPICS if t.delivery is not Delivery.QUERY]
     heard: set[tuple[str, str, str]] = set()
     with contextlib.ExitStack() as stack:
@@ -81,15 +81,24 @@ def test_every_identity_does_exactly_what_the_table_says(folder: Path, port: int
                     heard.add((name, str(sample.key_expr), sample.payload.to_string()))
 
                 session.declare_subscriber(key, take)
+        keys = {name: [key for topic in streams for key in keys_of(name, topic)] for name in NODES}
+        # what services send by: a declared publisher is silent until it has been told of a subscriber
+        declared = [(name, sessions[name].declare_publisher(key)) for name in NODES for key in keys[name]]
         time.sleep(SETTLE_S)
         for name, session in sessions.items():
-            for topic in streams:
-                leaf = Identity.parse(name).role if topic.name.endswith("*") else None
-                session.put(topic.key("uav1", leaf), name)
-                if leaf:
-                    session.put(topic.key("uav1", "slam"), name)  # another service's leaf
+            for key in keys[name]:
+                session.put(key, f"{name} put")
+        for name, publisher in declared:
+            publisher.put(f"{name} declared")
         time.sleep(SETTLE_S)
-    assert heard == expected()
+    assert heard == {(n, key, f"{speaker} {how}") for n, key, speaker in expected() for how in ("put", "declared")}
+
+
+def keys_of(name: str, topic: Topic) -> list[str]:
+    """A node's own key of a topic; where each service has a leaf, another service's too."""
+    if not topic.name.endswith("*"):
+        return [topic.key("uav1")]
+    return sorted({topic.key("uav1", leaf) for leaf in (Identity.parse(name).role, "slam")})
 
 
 def expected() -> set[tuple[str, str, str]]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -65,6 +67,7 @@ def test_a_sound_machine_has_no_trouble() -> None:
         (replace(SOUND, clock_synchronised=False), "clock", "warn", "not synchronised"),
         (replace(SOUND, shm_free_bytes=10**6), "shared memory", "fail", "/dev/shm"),
         (replace(SOUND, services=(), lockable_bytes=8_000_000), "shared memory", "warn", "8000 KB"),
+        (replace(SOUND, closed=("/var/lib/treedock/recordings",)), "rights", "warn", "may not look"),
         (replace(SOUND, disk_free_bytes=10**8), "disk", "fail", "0.1 GB"),
         (replace(SOUND, disk_free_bytes=2 * 10**9), "disk", "warn", "2.0 GB"),
         (replace(SOUND, recordings_cut=("a.mcap",)), "recordings", "warn", "1 recording"),
@@ -127,6 +130,30 @@ def test_the_age_of_a_calibration_is_what_it_says_not_the_files(tmp_path: Path) 
     assert gather(config).calibration_days == 200.0
     file.write_text("{}")
     assert gather(config).calibration_days is None
+
+
+def test_a_user_without_rights_is_told_so(tmp_path: Path) -> None:
+    """What was seen on an installed machine: PermissionError, called a bug."""
+    closed = tmp_path / "closed"
+    (closed / "recordings").mkdir(parents=True)
+    code = (
+        "import os\n"
+        "from pathlib import Path\n"
+        "from services.doctor import facts\n"
+        "from services.recorder import recover\n"
+        "if os.geteuid() == 0:\n"
+        "    os.setgroups([])\n"
+        "    os.setuid(65534)\n"
+        f"folder = Path({str(closed / 'recordings')!r})\n"
+        "print(facts._closed((folder,)), facts._nearest(folder), facts._cut(folder))"
+    )
+    closed.chmod(0o000)
+    try:
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    finally:
+        closed.chmod(0o755)
+    assert str(closed / "recordings") in done.stdout, done.stderr
+    assert str(closed / "recordings") not in done.stdout.partition("]")[2]
 
 
 def test_a_machine_is_really_looked_at(tmp_path: Path) -> None:
