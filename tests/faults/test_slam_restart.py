@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -55,19 +55,20 @@ class Seen:
 def room() -> Played:
     """A turn of 60 degrees and back, again and again."""
     there = turn_on_the_spot(KILL_AT, 60.0)
-    path = [*there, *reversed(there)] * 10
-    frames = []
-    for seq, T in enumerate(path):
-        grey, depth_m = look(T)
-        raw = np.round(depth_m * INTRINSICS.depth_scale).astype(np.uint16)
-        colour = np.repeat(grey[:, :, None], 3, axis=2)
-        stamp_ns = round((seq + 1) * PERIOD_S * 1e9)
-        frames.append(RgbdFrame(
-            stamp_ns=stamp_ns, seq=seq, intrinsics=INTRINSICS, depth=raw.tobytes(), colour=colour.tobytes(),
-            accel_camera=(0.0, -9.81, 0.0),
-        ))  # fmt: skip
+    views = [_view(T) for T in there]
+    order = [*range(KILL_AT), *reversed(range(KILL_AT))] * 10
+    frames = [replace(views[k], stamp_ns=round((seq + 1) * PERIOD_S * 1e9), seq=seq) for seq, k in enumerate(order)]
     T_map_world = level_camera([0.0, 0.0, 0.0], 0.0) @ inverse(there[0])
-    return Played(frames, {seq: T_map_world @ T for seq, T in enumerate(path)})
+    return Played(frames, {seq: T_map_world @ there[k] for seq, k in enumerate(order)})
+
+
+def _view(T_world_camera: F64) -> RgbdFrame:
+    grey, depth_m = look(T_world_camera)
+    raw = np.round(depth_m * INTRINSICS.depth_scale).astype(np.uint16)
+    return RgbdFrame(
+        stamp_ns=1, seq=0, intrinsics=INTRINSICS, depth=raw.tobytes(),
+        colour=np.repeat(grey[:, :, None], 3, axis=2).tobytes(), accel_camera=(0.0, -9.81, 0.0),
+    )  # fmt: skip
 
 
 def recorded() -> Played:
