@@ -67,11 +67,11 @@ def _report(live: Live, frames: int, seed: int) -> BenchReport:
     track, latency = _percentiles(live.track_ms), _percentiles(live.latency_ms)
     parts = _parts(live, frames)
     rows = [
-        "| frames | tracking (ms), median | p95 | max | pose after (ms), median | p95 | cores | keyframes in the map | memory (MB) | dropped |",
+        "| frames | tracking (ms), median | p95 | max | pose after (ms), median | p95 | cores | keyframes in the map | memory (MB) | not answered |",
         "|---|---|---|---|---|---|---|---|---|---|",
         *parts,
         "",
-        f"{live.sent} frames sent, {live.dropped} dropped, {live.lost} lost; {live.keyframes} keyframes made, {live.alive[-1]} of them in the map "
+        f"{live.sent} frames sent in {live.wall_s:.0f} s, {live.dropped} not answered, {live.lost} lost; {live.keyframes} keyframes made, {live.alive[-1]} of them in the map "
         f"at the end; {live.loops} loops; {live.peak_mb:.0f} MB at most; position error {live.error_m[-1]:.2f} m at the end, "
         f"{max(live.error_m):.2f} m at most; {live.first_pose_s:.2f} s from the start of the process to the first pose.",
     ]
@@ -90,7 +90,7 @@ def _report(live: Live, frames: int, seed: int) -> BenchReport:
             "walk": f"{frames} frames, {LENGTH_M:g} m at 1 m/s on a circuit of {CIRCUIT_M:g} m, forest of seed {seed}, 640x480 "
             "rendered at half size, s 0.08 px",
             "service": f"`treedock slam` and a router as processes, raw frames over Zenoh at {RATE_HZ:g} Hz, 1000 features, map kept on disk",
-            "cores": "CPU time of all threads of the slam process over wall time",
+            "cores": "CPU time of all threads of the slam process over the walk's length; a frame is sent when the one before is answered",
         },
         table="\n".join(rows),
     )  # fmt: skip
@@ -106,7 +106,7 @@ def _parts(live: Live, frames: int) -> list[str]:
         track = _percentiles(np.array(live.track_ms)[inside].tolist())
         latency = _percentiles(np.array(live.latency_ms)[inside].tolist())
         a, b = looks * begin // frames, looks * end // frames
-        seconds = live.wall_s * (b - a) / looks
+        seconds = live.walk_s * (b - a) / looks
         lines.append(
             f"| {begin} to {end} | {track[0]:.1f} | {track[1]:.1f} | {track[2]:.0f} | {latency[0]:.1f} | {latency[1]:.1f} "
             f"| {(cpu_s[b] - cpu_s[a]) / seconds:.2f} | {live.alive[b - 1]} | {live.rss_mb[b - 1]:.0f} | {end - begin - len(inside)} |"

@@ -116,6 +116,12 @@ class Chain:
         self._frame_ms.append((time.perf_counter() - begin) * 1e3)
         self.counts.frames += 1
 
+    def follow(self, keyframes_ns: Iterable[int]) -> None:
+        """Have slam make keyframes of the frames with these stamps."""
+        slam = self._services.get("slam")
+        if slam is not None:
+            slam.keyframes_ns = tuple(keyframes_ns)
+
     def hear(self, state: VehicleState) -> None:
         """Take what the autopilot said."""
         self._autopilot.publish(VEHICLE_STATE, state)
@@ -179,6 +185,7 @@ def run_offline(
     *,
     builders: Mapping[str, Builder] | None = None,
     companions: Iterable[VehicleState] = (),
+    keyframes_ns: Iterable[int] = (),
     skip_bad_frames: bool = False,
     progress: Callable[[Counts], None] | None = None,
 ) -> OfflineResult:
@@ -189,6 +196,7 @@ def run_offline(
         config: of every service.
         builders: the services by name (slam, mapper, detector, refiner, or some of them); by default the real ones.
         companions: what the autopilot said meanwhile, in order of time; each is heard before the first frame after it.
+        keyframes_ns: stamps of the keyframes that a flight made of these frames; slam follows them.
         skip_bad_frames: go on past frames that cannot be used, and count them.
         progress: called after each frame with the counts so far.
 
@@ -204,6 +212,7 @@ def run_offline(
         )
     chain = Chain(config, builders, first.stamp_ns)
     chain.counts.skipped = skipped
+    chain.follow(keyframes_ns)
     heard = iter(companions)
     waiting = next(heard, None)
     for frame in itertools.chain([first], good):

@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from schemas.topics import VEHICLE_STATE
+from schemas.slam import Keyframe
+from schemas.topics import SLAM_KEYFRAME, VEHICLE_STATE
 from schemas.vehicle import VehicleState
 from services.camera.sources import Source, open_recording
 from services.evaluate import exports, gis_exports
@@ -42,7 +43,7 @@ def process_sequence(
     source = open_recording(sequence, settings)
     _single_threaded()
     result = run_offline(
-        source, config, companions=_vehicle_states(sequence), skip_bad_frames=skip_bad_frames,
+        source, config, companions=_vehicle_states(sequence), keyframes_ns=recorded_keyframes(sequence), skip_bad_frames=skip_bad_frames,
         progress=None if progress is None else lambda counts: progress(counts, source),
     )  # fmt: skip
     result.stage_ms.update({f"camera.{stage}": ms for stage, ms in sorted(source.stage_ms.items())})
@@ -61,6 +62,16 @@ def _vehicle_states(sequence: Path) -> Iterator[VehicleState]:
     for entry in messages(sequence, (VEHICLE_STATE,)):
         if isinstance(entry, Recorded) and isinstance(entry.message, VehicleState):
             yield entry.message
+
+
+def recorded_keyframes(sequence: Path) -> list[int]:
+    """Return the stamps of the keyframes in an MCAP recording: of the same views the trees come out as in the flight."""
+    from services.recorder.reader import Recorded, messages
+
+    if sequence.is_dir():
+        return []
+    found = (entry.message for entry in messages(sequence, (SLAM_KEYFRAME,)) if isinstance(entry, Recorded))
+    return [message.stamp_ns for message in found if isinstance(message, Keyframe)]
 
 
 def result_files(title: str, result: OfflineResult, values: dict[str, Any]) -> dict[str, bytes]:

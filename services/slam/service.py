@@ -60,6 +60,8 @@ class SlamService:
         self._last_stamp_ns = -1
         self._idle_periods = 0
         self._polished = True
+        self.keyframes_ns: tuple[int, ...] = ()
+        """Stamps of the keyframes of a flight whose recording comes: they are followed."""
 
     def on_vehicle(self, state: VehicleState) -> None:
         """Keep the autopilot's idea of up (its roll and pitch)."""
@@ -134,6 +136,7 @@ class SlamService:
             self._intrinsics = frame.intrinsics
             # a new map is named by its first frame: a restarted slam never passes it off as the old one
             self.slam = self._maps.begin(frame.intrinsics, frame.stamp_ns)
+            self.slam.follow_keyframes(self.keyframes_ns)
         return self.slam
 
     def _attitude(self, stamp_ns: int) -> Matrix | None:

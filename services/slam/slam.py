@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from services.slam.camera import camera_model
 from services.slam.config import SlamConfig
 from services.slam.features import Extractor, Features
 from services.slam.ground import ground_up
-from services.slam.keyframing import KeyframeRule
+from services.slam.keyframing import KeyframeRule, Rest
 from services.slam.links import shared_counts
 from services.slam.loops import Loops
 from services.slam.mapping import Mapping
@@ -80,7 +80,7 @@ class Slam:
         self._reference = -1
         self._anchor: F64 = np.eye(4)
         """T_keyframe_camera of the last tracked frame."""
-        self._rule = KeyframeRule(config)
+        self._rule, self._rest = KeyframeRule(config), Rest()
         self._trail = Trail() if keep_trail else None
         self._revision = 0
         """Of the mapping's corrections, the last one taken over; and of its loops."""
@@ -241,8 +241,10 @@ class Slam:
         self._motion.update(stamp_ns, None if self._last is None else _step(self._last, frame))
         self.shutter.settle(self._motion.measured)
         new: list[NewKeyframe] = []
-        if self.graph_version == 0 or self._rule.wants(frame, self.crew.waiting):
+        if self._rule.wants(stamp_ns, frame, self.crew.waiting) or self.graph_version == 0:
             new, graph = self._make_keyframe(frame, graph)
+        if self._rest.begins(stamp_ns, made=bool(new)):
+            self.crew.submit(self.mapping.adjust_all)
         self._set_anchor(frame)
         self._last = frame
         if self._trail is not None:
@@ -289,6 +291,10 @@ class Slam:
         """Go on with a map that was put into the atlas: nothing is told of it until a frame is located in it."""
         self.map_id, self.graph_version, self.reset_counter = map_id, graph_version, reset_counter
         self._upright.sigma_rad, self._era0, self._taken_up = up_sigma_rad, era, True
+
+    def follow_keyframes(self, stamps_ns: Iterable[int]) -> None:
+        """Make keyframes of the frames that another run over the same frames chose: then both see the same."""
+        self._rule.follow(stamps_ns)
 
     def _set_anchor(self, frame: Tracked) -> None:
         kf = self.atlas.keyframes

@@ -1,14 +1,23 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from schemas.camera import RgbdFrame
+from schemas.codec import encode
+from schemas.slam import Keyframe
+from schemas.topics import CAMERA_RGBD, SLAM_KEYFRAME
 from services.camera.sources import BadFrame
 from services.common.config import TreedockConfig
+from services.common.context import Context
 from services.common.errors import InputError
 from services.evaluate.metrics import metrics, summary_ms
 from services.evaluate.offline import run_offline
+from services.evaluate.sequence import recorded_keyframes
+from services.recorder.mcap_file import McapFile
 from tests.camera_data import frame, stamp_ns
+from tests.examples import all_messages
 from tests.stub_chain import BUILDERS
 
 
@@ -49,6 +58,36 @@ def test_a_source_without_a_usable_frame_is_refused() -> None:
         run_offline([BadFrame(1, "a.jpg: empty")], TreedockConfig(), builders=BUILDERS, skip_bad_frames=True)
     with pytest.raises(InputError, match="no frames"):
         run_offline([], TreedockConfig(), builders=BUILDERS)
+
+
+def test_the_keyframes_of_a_recorded_flight_are_read(tmp_path: Path) -> None:
+    keyframe = next(m for m in all_messages().values() if isinstance(m, Keyframe))
+    stamps = [stamp_ns(i) for i in (0, 3, 7)]
+    with McapFile(tmp_path / "flight.mcap") as file:
+        for stamp in stamps:
+            data = encode(keyframe.model_copy(update={"stamp_ns": stamp}))
+            file.add(SLAM_KEYFRAME.key("uav1"), Keyframe.schema_id(), Keyframe.encoding(), bytes(data), stamp)
+    assert recorded_keyframes(tmp_path / "flight.mcap") == stamps
+    assert recorded_keyframes(tmp_path) == [], "a folder has none"
+
+
+def test_slam_is_told_of_a_flights_keyframes() -> None:
+    told: list[tuple[int, ...]] = []
+
+    class Told:
+        keyframes_ns: tuple[int, ...] = ()
+        slam = None
+
+        def on_frame(self, _: RgbdFrame) -> None:
+            told.append(self.keyframes_ns)
+
+    def build(context: Context) -> Told:
+        service = Told()
+        context.on(CAMERA_RGBD, service.on_frame)
+        return service
+
+    run_offline(frames(2), TreedockConfig(), builders={"slam": build}, keyframes_ns=[stamp_ns(1)])
+    assert told == [(stamp_ns(1),)] * 2
 
 
 def test_durations_are_summed_up() -> None:

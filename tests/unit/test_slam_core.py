@@ -109,6 +109,36 @@ def test_a_blackout_is_told_and_the_place_found_again() -> None:
     assert back.reset_counter != lost.reset_counter
 
 
+def test_a_camera_at_rest_gives_time_for_the_whole_map() -> None:
+    slam, period_ns = Slam(INTRINSICS, SlamConfig(features=300)), 66_666_667
+    path = turn_on_the_spot(12, 30.0)
+    results = []
+    for index, T in enumerate([*path, *[path[-1]] * 70]):
+        grey, depth_m = look(T)
+        results.append(slam.track(index * period_ns, grey, depth_m))
+    made = [k for k, r in enumerate(results) if r.new_keyframes]
+    whole = [k for k, r in enumerate(results) if r.graph is not None and r.graph.reason == "full_ba"]
+    assert len(whole) == 1, "once, and not again while nothing new comes"
+    assert whole[0] - made[-1] == pytest.approx(2e9 / period_ns, abs=2)
+
+
+def test_another_runs_keyframes_are_followed() -> None:
+    views = [look(T) for T in turn_on_the_spot(24, 60.0)]
+
+    def keyframes(config: SlamConfig, follow: tuple[int, ...] = (), without: int = -1) -> tuple[int, ...]:
+        slam = Slam(INTRINSICS, config)
+        slam.follow_keyframes(follow)
+        results = [slam.track(k, *view) for k, view in enumerate(views) if k != without]
+        return tuple(r.stamp_ns for r in results if r.new_keyframes)
+
+    often, seldom = SlamConfig(features=300, keyframe_ratio=0.95), SlamConfig(features=300, keyframe_ratio=0.7)
+    flown = keyframes(often)
+    assert keyframes(seldom) != flown
+    assert keyframes(seldom, flown) == flown
+    lost = flown[2]
+    assert keyframes(seldom, flown, without=lost) == (*flown[:2], lost + 1, *(k for k in flown[3:] if k > lost + 1))
+
+
 def test_frames_without_depth_do_not_start_a_map() -> None:
     slam = Slam(INTRINSICS, CONFIG)
     grey, depth = look(turn_on_the_spot(1, 0.0)[0])
