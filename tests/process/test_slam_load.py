@@ -33,6 +33,9 @@ class Seen:
     sent_s: dict[int, float] = field(default_factory=dict)
     poses: list[tuple[float, Pose]] = field(default_factory=list)
 
+    def on_pose(self, pose: Pose) -> None:
+        self.poses.append((time.monotonic(), pose))
+
     def latencies_s(self) -> list[float]:
         return [at_s - self.sent_s[pose.seq] for at_s, pose in self.poses]
 
@@ -77,7 +80,7 @@ def test_a_slam_without_time_drops_frames_counts_them_and_is_not_late_by_a_queue
     played, seen = room(), Seen()
     with routed.bus() as bus:
         health = HealthWatch(bus)
-        bus.subscribe(SLAM_POSE, lambda pose: seen.poses.append((time.monotonic(), pose)))
+        bus.subscribe(SLAM_POSE, seen.on_pose)
         slam = slam_process(routed)
         assert until(lambda: bus.alive("slam"), 120.0, bus), routed.said("slam")
         send(bus, seen, played, BEFORE)
