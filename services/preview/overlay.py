@@ -7,6 +7,7 @@ the depth image shows it, a green frame when docked.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,7 +82,7 @@ def overlay_of(
     """
     T = None if pose is None or pose.T_map_camera is None else from_transform(pose.T_map_camera)
     wanted = mission.target_tree_id if mission is not None else None
-    outlines = {} if T is None else {t.id: o for t in trees if (o := trunk_outline(t, inverse(T), intrinsics))}
+    outlines = {} if T is None else trunk_outlines(trees, inverse(T), intrinsics)
     command = guidance.command if guidance is not None else None
     return Overlay(
         mapped=outlines.get(wanted) if wanted is not None else None,
@@ -102,28 +103,32 @@ _ARROWS: dict[str, tuple[float, float]] = {
 
 def trunk_outline(tree: Tree, T_camera_map: NDArray[np.float64], i: Intrinsics) -> Outline | None:
     """Return the quadrangle of a trunk, None when it is behind the camera, out of view or far."""
-    foot, axis = np.array([tree.x_m, tree.y_m, tree.z_m]), np.array(tree.axis)
-    ends = apply(T_camera_map, np.stack([foot + h * axis for h in (_TRUNK_LOW_M, _TRUNK_HIGH_M)]))
-    if ends[:, 2].min() < _NEAR_M or ends[:, 2].max() > _OTHER_WITHIN_M:
-        return None
-    along = ends[1] - ends[0]
-    sideways = np.cross(along, 0.5 * (ends[0] + ends[1]))
-    sideways *= tree.radius_m / max(float(np.linalg.norm(sideways)), 1e-9)
-    corners = np.stack([ends[0] - sideways, ends[0] + sideways, ends[1] + sideways, ends[1] - sideways])
-    pixels = np.stack(
-        [i.fx * corners[:, 0] / corners[:, 2] + i.cx, i.fy * corners[:, 1] / corners[:, 2] + i.cy], axis=1
-    )
-    if (
-        pixels[:, 0].max() < 0
-        or pixels[:, 0].min() > i.width
-        or pixels[:, 1].max() < 0
-        or pixels[:, 1].min() > i.height
-    ):
-        return None
-    low_left, low_right, high_right, high_left = ((float(u), float(v)) for u, v in pixels)
-    if low_left[0] > low_right[0]:
-        low_left, low_right, high_right, high_left = low_right, low_left, high_left, high_right
-    return Outline((low_left, low_right, high_right, high_left), f"{tree.id}  {200.0 * tree.radius_m:.0f} cm")
+    return trunk_outlines((tree,), T_camera_map, i).get(tree.id)
+
+
+def trunk_outlines(trees: Sequence[Tree], T_camera_map: NDArray[np.float64], i: Intrinsics) -> dict[int, Outline]:
+    """Return the quadrangles of the trunks that are in view and near, by their number: all worked out at once."""
+    if not trees:
+        return {}
+    axes = np.array([t.axis for t in trees])
+    feet = np.array([(t.x_m, t.y_m, t.z_m) for t in trees])
+    low, high = (apply(T_camera_map, feet + h * axes) for h in (_TRUNK_LOW_M, _TRUNK_HIGH_M))
+    sideways = np.cross(high - low, 0.5 * (low + high))
+    radii = np.array([t.radius_m for t in trees])
+    sideways *= (radii / np.maximum(np.linalg.norm(sideways, axis=1), 1e-9))[:, None]
+    corners = np.stack([low - sideways, low + sideways, high + sideways, high - sideways], axis=1)
+    near = (np.minimum(low[:, 2], high[:, 2]) >= _NEAR_M) & (np.maximum(low[:, 2], high[:, 2]) <= _OTHER_WITHIN_M)
+    depth = np.where(near[:, None], corners[:, :, 2], 1.0)
+    u, v = i.fx * corners[:, :, 0] / depth + i.cx, i.fy * corners[:, :, 1] / depth + i.cy
+    seen = near & (u.max(axis=1) >= 0) & (u.min(axis=1) <= i.width) & (v.max(axis=1) >= 0) & (v.min(axis=1) <= i.height)
+    return {trees[k].id: _named(trees[k], u[k], v[k]) for k in np.flatnonzero(seen).tolist()}
+
+
+def _named(tree: Tree, u: NDArray[np.float64], v: NDArray[np.float64]) -> Outline:
+    a, b, c, d = zip(u.tolist(), v.tolist(), strict=True)
+    if a[0] > b[0]:
+        a, b, c, d = b, a, d, c
+    return Outline((a, b, c, d), f"{tree.id}  {200.0 * tree.radius_m:.0f} cm")
 
 
 def _seen(target: Target | None, mapped: Outline | None, i: Intrinsics) -> Outline | None:

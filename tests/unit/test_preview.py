@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any, cast
 
 import cv2
@@ -192,3 +193,14 @@ def test_pictures_only_while_somebody_looks_one_per_frame_and_bad_ones_are_count
     feed(frame(STAMP_NS, b"\xff\xd8\xff nonsense"))
     assert context.health.counters["dropped_bad_frames"] == 1
     assert len(seen) == 2
+
+
+def test_a_forest_of_five_hundred_trees_costs_no_more_than_a_frame_may() -> None:
+    forest = tuple(tree(k, 2.0 + 0.01 * k, -3.0 + 0.012 * k) for k in range(500))
+    spent_s = []
+    for _ in range(5):
+        begin_s = time.thread_time()
+        shown = overlay_of(I, pose(), forest, None, None, None)
+        spent_s.append(time.thread_time() - begin_s)
+    assert len(shown.others) > 100
+    assert min(spent_s) < 0.02  # 3 ms measured; one tree after the other took 70
