@@ -203,4 +203,4 @@ def test_a_forest_of_five_hundred_trees_costs_no_more_than_a_frame_may() -> None
         shown = overlay_of(I, pose(), forest, None, None, None)
         spent_s.append(time.thread_time() - begin_s)
     assert len(shown.others) > 100
-    assert min(spent_s) < 0.02  # 3 ms measured; one tree after the other took 70
+    assert min(spent_s) < 0.02  # 2.3 ms measured; one tree after the other took 39
