@@ -6,6 +6,7 @@ commit that was finished, and nothing of one that was not. Readers (QGIS) do not
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 import struct
 import time
@@ -17,6 +18,8 @@ from services.inventory import schema
 from services.inventory.values import Changes, Contents, InventoryTree, Site
 
 APPLICATION_ID = 0x47504B47  # "GPKG", requirement 2
+_GATHER_S = 5.0
+"""The file alone, without the log beside it, is at most about so far behind while the station writes."""
 USER_VERSION = 10300
 _BUSY_MS = 2_000
 _WGS84 = (
@@ -84,6 +87,7 @@ class GeoPackage:
                 self._db.close()
             raise InputError(f"inventory {path}: cannot be opened ({error}); name another with --set station.inventory.database=FILE") from error  # fmt: skip
         self._extents: dict[str, tuple[float, float, float, float]] = {}
+        self._gathered_s = time.monotonic()
 
     def _prepare(self) -> None:
         db = self._db
@@ -121,6 +125,7 @@ class GeoPackage:
         db.execute("CREATE TABLE treedock_inventory (version INTEGER NOT NULL)")
         db.execute("INSERT INTO treedock_inventory VALUES (?)", (schema.VERSION,))
         db.execute("COMMIT")
+        db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
 
     def _register(self, table: str, kind: str, srs: int | None) -> None:
         self._db.execute(
@@ -162,6 +167,15 @@ class GeoPackage:
             if db.in_transaction:
                 db.execute("ROLLBACK")
             raise
+        self._gather()
+
+    def _gather(self) -> None:
+        """Now and then bring what is safe in the log beside the file into the file: whoever copies it alone has it."""
+        now_s = time.monotonic()
+        if now_s - self._gathered_s >= _GATHER_S:
+            self._gathered_s = now_s
+            with contextlib.suppress(sqlite3.Error):  # it is safe where it is, and comes with the next
+                self._db.execute("PRAGMA wal_checkpoint(PASSIVE)")
 
     def _upsert(self, table: str, rows: list[tuple[Any, ...]]) -> None:
         if rows:

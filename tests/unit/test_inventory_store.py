@@ -108,6 +108,28 @@ def test_what_was_written_is_read_back_the_same(tmp_path: Path) -> None:
     assert {s.number: s for s in contents.sites} == book.sites
 
 
+def test_the_file_alone_is_a_geopackage_while_the_station_writes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Somebody copies the one file in the field, without the log that SQLite keeps beside it."""
+    path, copy = tmp_path / "inventory.gpkg", tmp_path / "copy.gpkg"
+    store = GeoPackage(path)
+    shutil.copy(path, copy)
+    assert copy.read_bytes()[68:72] == b"GPKG"
+    early = GeoPackage(copy)
+    assert early.rows("trees") == []
+    early.close()
+    monkeypatch.setattr("services.inventory.geopackage._GATHER_S", 0.0)
+    book = Inventory(PLACED, store.load())
+    book.take("uav1", listed(forest(3)), S)
+    store.write(book.written(), book.sites)
+    shutil.copy(path, copy)
+    late = GeoPackage(copy)
+    assert len(late.rows("trees")) == len(store.rows("trees")) == len(book.trees) > 0
+    late.close()
+    store.close()
+
+
 def test_a_commit_is_whole_or_absent(tmp_path: Path) -> None:
     path = tmp_path / "inventory.gpkg"
     book = filled(path)
