@@ -1,6 +1,7 @@
 """An aircraft without a camera: the real mission over a small world, on the real bus.
 
-As a process: ``python -m tests.station.stub_aircraft PORT UAV [SPEED] [SEED]``.
+As a process: ``python -m tests.station.stub_aircraft PORT UAV [SPEED] [SEED]``; with STUB_CAMERA set it has one after all,
+rendered, for the preview alone.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from schemas.topics import (
     HEALTH,
     MAP_SKETCH,
     MISSION_STATE,
+    PREVIEW_IMAGE,
     SLAM_POSE,
     TREES_LIST,
     TREES_TARGET,
@@ -35,6 +37,7 @@ from services.common.runtime import LiveContext, run_service
 from services.common.stop import end_process
 from services.navigator.commands import CommandDesk
 from services.router.config import RouterConfig
+from tests.station.stub_camera import StubCamera
 from tests.unit.navigator_world import SERVICES, STEP_S, World, tree
 
 _COVARIANCE = tuple(
@@ -94,6 +97,7 @@ class StubAircraft:
         self._reporters = {name: HealthReporter(name, context.health) for name in (*SERVICES, "navigator", "autopilot")}
         self._heard_station_s = -1.0
         self._ticks = 0
+        self._camera = StubCamera(self.world.trees, seed) if os.environ.get("STUB_CAMERA") else None
 
     def register(self) -> None:
         c = self.context
@@ -124,6 +128,12 @@ class StubAircraft:
         if world._target is not None:
             c.publish(TREES_TARGET, world._target.message.model_copy(update={"seq": self._ticks}))
         c.publish(MISSION_STATE, world.outputs.state.model_copy(update={"seq": self._ticks}))
+        if self._camera is not None and self._ticks % 3 == 0 and c.listened(PREVIEW_IMAGE):
+            known = tuple(self.known.values())
+            target = None if world._target is None else world._target.message
+            c.publish(
+                PREVIEW_IMAGE, self._camera.picture(pose, known, target, world.outputs.state, world.outputs.guidance)
+            )
         if self._look():
             self.version += 1
             trees = tuple(self.known[k] for k in sorted(self.known))
