@@ -16,7 +16,7 @@ from services.evaluate.top_view import top_view_svg
 
 _MAX_PICTURES = 60
 _FILES = (
-    ("trees.gpkg, trees.geojson, trees.csv", "the trees; QGIS opens the GeoPackage as it is (metres in the map's own frame, or global with a start point)"),
+    ("trees.gpkg, trees.geojson, trees.csv", "the trees; QGIS opens the GeoPackage as it is, in metres of the map (`treedock inventory` places the trees of flights on the globe)"),
     ("trees.json", "the trees with everything that is known of them"),
     ("cloud.laz, cloud.ply", "the map's points; CloudCompare and QGIS open both"),
     ("trajectory.txt, trajectory_online.txt", "the camera's path in TUM's format: final estimate, and as a live run would have told it"),
@@ -29,7 +29,7 @@ h1, h2 { font-weight: 600; } table { border-collapse: collapse; margin: 0.5rem 0
 th, td { padding: 0.2rem 0.7rem; text-align: right; border-bottom: 1px solid #d5ddd6; font-variant-numeric: tabular-nums; }
 th:first-child, td:first-child, .left2 th:nth-child(-n+3), .left2 td:nth-child(-n+3), .left5 th, .left5 td { text-align: left; }
 svg { width: 100%; height: auto; background: #f6f8f5; border: 1px solid #d5ddd6; }
-.warn { color: #9a3412; } .wide { overflow-x: auto; } p { max-width: 46rem; }
+.warn { color: #9a3412; } .wide { overflow-x: auto; } th { white-space: nowrap; } p { max-width: 46rem; }
 .verdict { padding: 0.6rem 1rem; border-left: 6px solid #9aa69d; background: #f6f8f5; font-size: 1.1rem; font-weight: 600; }
 .verdict.good { border-color: #15803d; color: #14532d; } .verdict.warn { border-color: #d97706; }
 .trunks { display: flex; flex-wrap: wrap; gap: 0.75rem; } .trunks svg { width: 190px; }

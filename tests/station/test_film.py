@@ -29,7 +29,7 @@ def test_film_strip(ground: Ground, page: Page, monkeypatch: pytest.MonkeyPatch)
     page.wait_for_selector("#order-start:not([aria-disabled])", timeout=90_000)
     page.wait_for_timeout(1_500)
     taken = [page.screenshot()]
-    held(page, "#order-start")
+    _start(page)
     for name, pause_s in (("scan", 5.0), ("approach", 2.0), ("docked", 1.0)):
         true(page, f"{STATE} === '{name}'", 120.0)
         page.wait_for_timeout(pause_s * 1e3)
@@ -58,9 +58,21 @@ def test_film_strip(ground: Ground, page: Page, monkeypatch: pytest.MonkeyPatch)
     pytest.fail("the film strip is too big")
 
 
+def _start(page: Page) -> None:
+    """Hold START until it flies: on a busy machine a page may show a state too old to command with."""
+
+    def flies() -> bool:
+        if page.evaluate(f"['idle', 'landed'].includes({STATE})"):
+            held(page, "#order-start")
+            page.wait_for_timeout(1_500)
+        return not page.evaluate(f"['idle', 'landed'].includes({STATE})")
+
+    assert until(flies, 120.0)
+
+
 def _aborted(page: Page) -> list[bytes]:
     """Fly again and abort; the log in the dark."""
-    held(page, "#order-start")
+    _start(page)
     true(page, f"{STATE} === 'scan'", 120.0)
     page.click("#tab-log")
     page.click("#theme")

@@ -2,6 +2,7 @@
 
 const RETRY_MS = [100, 250, 500, 1000];
 const SILENT_MS = 1500; // the station speaks five times a second
+const DEAD_MS = 4000; // a slow link has pauses too: opening anew there would only ask it to carry everything again
 
 function secret() {
   let kept = localStorage.getItem("treedock.secret");
@@ -85,7 +86,8 @@ export class Link {
 
   /** A half-open connection (a radio that fell silent) gives no close: drop it ourselves. */
   watch() {
-    if (this.socket && !this.up && performance.now() - this.openedAt > 3000) {
+    const now = performance.now();
+    if (this.socket && now - this.heardAt > DEAD_MS && now - this.openedAt > DEAD_MS) {
       const dead = this.socket;
       dead.close();
       dead.onclose?.();
