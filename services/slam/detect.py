@@ -22,6 +22,13 @@ EDGE_PX = 20
 """No corner nearer to a level's edge: the descriptor's turned patch would leave the image."""
 _CROWDED, _SPARSE = 8, 4
 """The threshold rises when a level has more candidates per corner wanted, and falls when it has fewer."""
+_POOR = 0.5
+"""Share of the corners wanted below which an image is searched again with its contrast stretched."""
+_STRETCH_BLUR_PX = 1.5
+_STRETCH_LEVEL = 3
+"""The finest level searched in a stretched image: what is smaller is blurred away, and its corners lie where noise put them."""
+_STRETCH_TO, _STRETCH_MOST = 40.0, 8.0
+"""The standard deviation of grey values that the stretched image has, and how much it is stretched at most."""
 _PATCH_RADIUS = 15
 _TENSOR_RADIUS = 3
 
@@ -127,6 +134,16 @@ def orient(image: U8, xy: F32) -> F64:
     return out
 
 
+def stretch(image: U8) -> U8:
+    """Return a flat image with more contrast: fog, dusk, a bare wall. Blurred first, or the sensor's noise would make the corners."""
+    import cv2
+
+    soft = cv2.GaussianBlur(image.astype(np.float32), (0, 0), _STRETCH_BLUR_PX)
+    mean, deviation = (float(value[0, 0]) for value in cv2.meanStdDev(soft))
+    gain = min(max(_STRETCH_TO / max(deviation, 1e-6), 1.0), _STRETCH_MOST)
+    return np.clip(128.0 + gain * (soft - mean), 0.0, 255.0).astype(np.uint8)
+
+
 class Detector:
     """Finds corners level by level; each level's FAST threshold follows the texture from image to image."""
 
@@ -135,6 +152,8 @@ class Detector:
 
         shares = scale ** -np.arange(levels, dtype=float)
         self._quota = np.round(corners * shares / shares.sum()).astype(int)
+        coarse = np.where(np.arange(levels) >= min(_STRETCH_LEVEL, levels - 1), shares, 0.0)
+        self._coarse = np.floor(corners * coarse / coarse.sum()).astype(int)
         self._scales = scale ** np.arange(levels, dtype=float)
         self._lowest = lowest
         self._threshold = [start] * levels
@@ -153,17 +172,25 @@ class Detector:
             out.append(cv2.resize(out[-1], size, interpolation=cv2.INTER_LINEAR).astype(np.uint8, copy=False))
         return out
 
-    def detect(self, image: U8, depth_m: F32) -> tuple[F64, F64, F64, NDArray[np.int32]]:
-        """Return the corners, octaves ascending.
+    def detect(self, image: U8, depth_m: F32) -> tuple[U8, tuple[F64, F64, F64, NDArray[np.int32]]]:
+        """Return the image that was searched, stretched where texture is poor, and its corners, octaves ascending.
 
         Places (N, 2) in the full size image, the same by OpenCV's reckoning (whole pixels of the level times its scale),
         directions (N,) and octaves (N,).
         """
+        found = self._search(image, depth_m, self._quota)
+        if len(found[0]) >= _POOR * self._quota.sum():
+            return image, found
+        image = stretch(image)
+        return image, self._search(image, depth_m, self._coarse)
+
+    def _search(self, image: U8, depth_m: F32, quota: I64) -> tuple[F64, F64, F64, NDArray[np.int32]]:
+        """Return up to ``quota`` (levels,) corners of each level."""
         places, whole, angles, octaves = [], [], [], []
         for level, small in enumerate(self.pyramid(image)):
             xy = self._candidates(level, small)
             strength = rate(small, xy, depth_m, self._scales[level])
-            chosen = xy[spread(xy, strength, self._quota[level], small.shape[1], small.shape[0])]
+            chosen = xy[spread(xy, strength, quota[level], small.shape[1], small.shape[0])]
             exact = np.empty((len(chosen), 2))
             place(small, chosen, exact)
             # pixel centres: scaling happens about the image's corner, half a pixel before the first centre

@@ -164,8 +164,8 @@ class Extractor:
 
     def extract(self, grey: U8, depth_m: NDArray[np.float32]) -> Features:
         """Return the features of an image (H, W) with its depth (H, W)."""
-        xy, whole, angle, octave = self._detector.detect(grey, depth_m)
-        desc, kept = self._describe(grey, whole, angle, octave)
+        searched, (xy, whole, angle, octave) = self._detector.detect(grey, depth_m)
+        desc, kept = self._describe(searched, whole, angle, octave)
         xy, angle, octave = xy[kept], angle[kept], octave[kept]
         depth, info, far = sample_depth(
             depth_m, xy, self._config.min_depth_m, 10.0 * self._config.max_depth_m, self._bf,
