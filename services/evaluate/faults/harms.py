@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from pymavlink.dialects.v20 import common as mav
 from services.common.config import TreedockConfig
 from services.evaluate.faults.bench_rig import Bench
 from services.evaluate.faults.flown import ENDED
-from services.evaluate.faults.killing import faults_of_comeback, passing
+from services.evaluate.faults.killing import passing
 from services.evaluate.faults.missions import Back, Flights
 from services.evaluate.faults.model import Result, Row
 from services.evaluate.faults.rig import ONBOARD, Rig
@@ -49,10 +49,6 @@ def rows() -> list[Row]:
             "it ends with exit code 2 within 10 s, in one line that names the file", _corrupt_config),
         Row("config corrupted in flight", "flight", "the recorder's configuration is overwritten with noise, and the recorder killed",
             "the mission flies on; the recorder is tried again, and back when the file is", _config_in_flight),
-        Row("corrupt map", "chain", "slam and mapper are killed and their saved maps overwritten with noise, or cut short",
-            "both are READY within 3.5 s, say that the map was left, and poses and trees come again", _corrupt_map),
-        Row("clock step", "chain", "slam, and then the router, are killed and started again on a machine whose clock was set by an hour",
-            "stamps go on as before within 20 ms; poses come again", _clock_step),
     ]  # fmt: skip
 
 
@@ -265,61 +261,3 @@ def _config_in_flight(bench: Bench) -> Result:
         return Back(back_s=None if back else 1e9)
 
     return passing(bench, "config corrupted in flight", harm, lands=False)
-
-
-def _corrupt_map(bench: Bench) -> Result:
-    chain, rng = bench.chain(), bench.rng("corrupt map")
-    state = chain.rig.folder / "state"
-    failed, backs, told = list[str](), list[float](), list[str]()
-    for damage in ("noise", "cut short"):
-        for service in ("slam", "mapper"):
-            before = chain.trees
-            assert before is not None, "the chain's start waits for trees"
-            harmed = _damage_when_dead(state, rng, damage, service)
-            back = chain.harm(service, before_restart=harmed)
-            words = faults_of_comeback(back, bench.limits) + chain.whole_again(before, 0)
-            failed += [f"{service}, {damage}: {word}" for word in words]
-            backs += [back.back_s] if back else []
-            told.append(
-                f"{service}, {damage}: {'; '.join(words) or 'whole again'}; it says: {chain.rig.said(service)[:160]}"
-            )
-            bench.tell(told[-1])
-    return Result(tuple(failed), {"back_s": max(backs, default=None)}, tuple(told))
-
-
-def _damage_when_dead(state: Path, rng: np.random.Generator, damage: str, service: str) -> Callable[[], None]:
-    """Return what overwrites a service's files while it is dead."""
-
-    def harm() -> None:
-        folder = state / "slam" if service == "slam" else state
-        files = [p for p in folder.rglob("*") if p.is_file() and (service == "slam" or "slam" not in p.parts)]
-        for path in files:
-            size = path.stat().st_size
-            path.write_bytes(rng.bytes(size) if damage == "noise" else path.read_bytes()[: size // 2])
-
-    return harm
-
-
-def _clock_step(bench: Bench) -> Result:
-    chain = bench.chain()
-    rig, failed, told, worst = chain.rig, list[str](), list[str](), 0.0
-    for service in ("slam", "router"):
-        before = chain.trees
-        assert before is not None, "the chain's start waits for trees"
-        path = rig.config_file(service)
-        values = json.loads(path.read_text(encoding="utf-8"))
-        path.write_text(json.dumps({**values, "clock_ahead_s": values["clock_ahead_s"] + 3600.0}), encoding="utf-8")
-        back = chain.harm(service)
-        rig.pump(4.0)
-        off_s = {name: h.stamp_ns * 1e-9 - time.time() + _age_s(rig, name) for name, h in rig.health.items()}
-        worst = max(worst, *(abs(v) for v in off_s.values()))
-        failed += [f"{service}: {name} {off:+.2f} s off" for name, off in off_s.items() if abs(off) > _CLOCK_S]
-        failed += faults_of_comeback(back, bench.limits) + chain.whole_again(before, 0)
-        told.append(f"{service} on a clock an hour ahead: stamps within {max(abs(v) for v in off_s.values()):.3f} s")
-    bench.close()  # its clocks are no longer this machine's
-    return Result(tuple(failed), {"clock_off_s": worst}, tuple(told))
-
-
-def _age_s(rig: Rig, name: str) -> float:
-    """Return how old the latest health of a service is."""
-    return time.monotonic() - rig.heard_s[name]

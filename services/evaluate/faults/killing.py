@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import signal
-import time
 from collections.abc import Callable
 from functools import partial
 
 from services.evaluate.faults.bench_rig import Bench
-from services.evaluate.faults.chain import SERVICES as CHAIN
 from services.evaluate.faults.missions import Back, Flights, Seen, line_of
 from services.evaluate.faults.model import Result, Row
-from services.evaluate.faults.rig import Comeback
-from services.evaluate.faults.verdict import Limits, common, faults_of, summary
+from services.evaluate.faults.verdict import common, faults_of, summary
 
 _RESPONSE = {
     "camera": "hold at once, land after 1.2 s", "slam": "hold at once, land after 1.2 s",
@@ -24,7 +21,7 @@ _RESPONSE = {
     "recorder": "fly on", "preview": "fly on", "station": "fly on; hold when it is away for 5 s",
     "router": "hold while nobody hears anybody, or fly on; the others stay alive and join again",
 }  # fmt: skip
-_SIGNALS = {"kill -9": signal.SIGKILL, "SIGSTOP": signal.SIGSTOP}
+SIGNALS = {"kill -9": signal.SIGKILL, "SIGSTOP": signal.SIGSTOP}
 
 
 def rows() -> list[Row]:
@@ -35,59 +32,9 @@ def rows() -> list[Row]:
             response if how == "kill -9" else f"{response}; noticed within 11.5 s",
             partial(_strike, service=service, how=how),
         )
-        for how in _SIGNALS
+        for how in SIGNALS
         for service, response in _RESPONSE.items()
     ]  # fmt: skip
-
-
-def chain_rows() -> list[Row]:
-    """Return the rows of the real services over a recording."""
-    return [
-        Row(
-            f"{how} {service} (real)", "chain", f"{how} of the real {service} at three random moments of a recording",
-            "back and READY within 3.5 s of its end; poses come again; every tree is there again, under its id within 5 cm",
-            partial(_strike_real, service=service, how=how),
-        )
-        for how in _SIGNALS
-        for service in CHAIN[1:]
-    ]  # fmt: skip
-
-
-def _strike_real(bench: Bench, service: str, how: str) -> Result:
-    chain, rng = bench.chain(), bench.rng(f"{how} {service} (real)")
-    failed, told, backs, noticed, ready = [], [], [], [], []
-    for _ in range(bench.moments):
-        chain.rig.pump(float(rng.uniform(0.5, 6.0)))
-        before = chain.trees
-        assert before is not None, "the chain's start waits for trees"
-        back = chain.harm(service, _SIGNALS[how])
-        since_ns = time.time_ns()
-        words = faults_of_comeback(back, bench.limits) + chain.whole_again(
-            before, since_ns if service == "detector" else 0
-        )
-        failed += words
-        backs.append(back.back_s if back else None)
-        noticed.append(back.noticed_s if back else None)
-        ready.append(back.ready_after_s() if back else None)
-        told.append(
-            f"{how} {service}: back {backs[-1] or -1:.2f} s, {len(before.trees)} trees, {'; '.join(words) or 'whole again'}"
-        )
-        bench.tell(told[-1])
-    measured = {
-        "back_s": max((b for b in backs if b), default=None),
-        "noticed_s": max((n for n in noticed if n), default=None),
-    }
-    return Result(tuple(failed), measured, tuple(told))
-
-
-def faults_of_comeback(back: Comeback | None, limits: Limits) -> list[str]:
-    """Return what of a service's return did not hold."""
-    if back is None:
-        return ["it did not come back"]
-    ready_s = back.ready_after_s()
-    late = [f"ready after {ready_s:.1f} s, not within {limits.back_s}"] if ready_s > limits.back_s else []
-    slow = back.noticed_s > limits.noticed_s
-    return late + ([f"noticed after {back.noticed_s:.1f} s, not within {limits.noticed_s}"] if slow else [])
 
 
 def _strike(bench: Bench, service: str, how: str) -> Result:
@@ -96,7 +43,7 @@ def _strike(bench: Bench, service: str, how: str) -> Result:
         flights = bench.flights(f"{how} {service}")
         flights.moment()
         others = _pids(flights.rig.supervisor.children, service)
-        one = flights.strike(service, _SIGNALS[how])
+        one = flights.strike(service, SIGNALS[how])
         seen.append(one)
         failed += [f"{one.state}: {word}" for word in faults_of(service, one, bench.limits)]
         gone = [

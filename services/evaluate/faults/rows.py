@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from services.evaluate.faults import harms, killing, network_rows
+from services.evaluate.faults import chain_rows, harms, killing, network_rows
 from services.evaluate.faults.model import Row
 
-ROWS: tuple[Row, ...] = (*killing.rows(), *killing.chain_rows(), *harms.rows(), *network_rows.rows())
+ROWS: tuple[Row, ...] = (*killing.rows(), *chain_rows.rows(), *harms.rows(), *network_rows.rows())
 
 
 def find(name: str) -> Row:

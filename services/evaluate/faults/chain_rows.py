@@ -1,0 +1,133 @@
+"""Rows of the real camera, slam, mapper, detector and refiner over a recording: killed, stopped, maps damaged, clocks set."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from services.evaluate.faults.bench_rig import Bench
+from services.evaluate.faults.chain import SERVICES as CHAIN
+from services.evaluate.faults.killing import SIGNALS
+from services.evaluate.faults.model import Result, Row
+from services.evaluate.faults.rig import Comeback, Rig
+from services.evaluate.faults.verdict import Limits
+
+_CLOCK_S = 0.02
+
+
+def rows() -> list[Row]:
+    """Return the rows of the real services over a recording."""
+    return [
+        Row(
+            f"{how} {service} (real)", "chain", f"{how} of the real {service} at three random moments of a recording",
+            "back and READY within 3.5 s of its end; poses come again; every tree is there again, under its id within 5 cm",
+            partial(_strike_real, service=service, how=how),
+        )
+        for how in SIGNALS
+        for service in CHAIN[1:]
+    ] + [
+        Row("corrupt map", "chain", "slam and mapper are killed and their saved maps overwritten with noise, or cut short",
+            "both are READY within 3.5 s, say that the map was left, and poses and trees come again", _corrupt_map),
+        Row("clock step", "chain", "slam, and then the router, are killed and started again on a machine whose clock was set by an hour",
+            "stamps go on as before within 20 ms; poses come again", _clock_step),
+    ]  # fmt: skip
+
+
+def _strike_real(bench: Bench, service: str, how: str) -> Result:
+    chain, rng = bench.chain(), bench.rng(f"{how} {service} (real)")
+    failed, told, backs, noticed, ready = [], [], [], [], []
+    for _ in range(bench.moments):
+        chain.rig.pump(float(rng.uniform(0.5, 6.0)))
+        before = chain.trees
+        assert before is not None, "the chain's start waits for trees"
+        since_ns = time.time_ns()
+        back = chain.harm(service, SIGNALS[how])
+        words = faults_of_comeback(back, bench.limits) + chain.whole_again(
+            before, since_ns if service == "detector" else 0
+        )
+        failed += words
+        backs.append(back.back_s if back else None)
+        noticed.append(back.noticed_s if back else None)
+        ready.append(back.ready_after_s() if back else None)
+        told.append(
+            f"{how} {service}: back {backs[-1] or -1:.2f} s, {len(before.trees)} trees, {'; '.join(words) or 'whole again'}"
+        )
+        bench.tell(told[-1])
+    measured = {
+        name: max((value for value in values if value is not None), default=None)
+        for name, values in (("back_s", backs), ("noticed_s", noticed), ("ready_s", ready))
+    }
+    return Result(tuple(failed), measured, tuple(told))
+
+
+def faults_of_comeback(back: Comeback | None, limits: Limits) -> list[str]:
+    """Return what of a service's return did not hold."""
+    if back is None:
+        return ["it did not come back"]
+    ready_s = back.ready_after_s()
+    late = [f"ready after {ready_s:.1f} s, not within {limits.back_s}"] if ready_s > limits.back_s else []
+    slow = back.noticed_s > limits.noticed_s
+    return late + ([f"noticed after {back.noticed_s:.1f} s, not within {limits.noticed_s}"] if slow else [])
+
+
+def _corrupt_map(bench: Bench) -> Result:
+    chain, rng = bench.chain(), bench.rng("corrupt map")
+    state = chain.rig.folder / "state"
+    failed, backs, told = list[str](), list[float](), list[str]()
+    for damage in ("noise", "cut short"):
+        for service in ("slam", "mapper"):
+            before = chain.trees
+            assert before is not None, "the chain's start waits for trees"
+            harmed = _damage_when_dead(state, rng, damage, service)
+            back = chain.harm(service, before_restart=harmed)
+            words = faults_of_comeback(back, bench.limits) + chain.whole_again(before, 0)
+            failed += [f"{service}, {damage}: {word}" for word in words]
+            backs += [back.back_s] if back else []
+            told.append(
+                f"{service}, {damage}: {'; '.join(words) or 'whole again'}; it says: {chain.rig.said(service)[:160]}"
+            )
+            bench.tell(told[-1])
+    return Result(tuple(failed), {"back_s": max(backs, default=None)}, tuple(told))
+
+
+def _damage_when_dead(state: Path, rng: np.random.Generator, damage: str, service: str) -> Callable[[], None]:
+    """Return what overwrites a service's files while it is dead."""
+
+    def harm() -> None:
+        folder = state / "slam" if service == "slam" else state
+        files = [p for p in folder.rglob("*") if p.is_file() and (service == "slam" or "slam" not in p.parts)]
+        for path in files:
+            size = path.stat().st_size
+            path.write_bytes(rng.bytes(size) if damage == "noise" else path.read_bytes()[: size // 2])
+
+    return harm
+
+
+def _clock_step(bench: Bench) -> Result:
+    chain = bench.chain()
+    rig, failed, told, worst = chain.rig, list[str](), list[str](), 0.0
+    for service in ("slam", "router"):
+        before = chain.trees
+        assert before is not None, "the chain's start waits for trees"
+        path = rig.config_file(service)
+        values = json.loads(path.read_text(encoding="utf-8"))
+        path.write_text(json.dumps({**values, "clock_ahead_s": values["clock_ahead_s"] + 3600.0}), encoding="utf-8")
+        back = chain.harm(service)
+        rig.pump(4.0)
+        off_s = {name: h.stamp_ns * 1e-9 - time.time() + _age_s(rig, name) for name, h in rig.health.items()}
+        worst = max(worst, *(abs(v) for v in off_s.values()))
+        failed += [f"{service}: {name} {off:+.2f} s off" for name, off in off_s.items() if abs(off) > _CLOCK_S]
+        failed += faults_of_comeback(back, bench.limits) + chain.whole_again(before, 0)
+        told.append(f"{service} on a clock an hour ahead: stamps within {max(abs(v) for v in off_s.values()):.3f} s")
+    bench.close()  # its clocks are no longer this machine's
+    return Result(tuple(failed), {"clock_off_s": worst}, tuple(told))
+
+
+def _age_s(rig: Rig, name: str) -> float:
+    """Return how old the latest health of a service is."""
+    return time.monotonic() - rig.heard_s[name]
