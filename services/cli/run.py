@@ -217,7 +217,8 @@ class Run:
             self._raise_if_given_up(supervisor)
             show()
             if conductor is not None:
-                if conductor.update(ready=supervisor.all_ready):
+                conductor.word = _world_lost(supervisor) or conductor.word
+                if _world_lost(supervisor) or conductor.update(ready=supervisor.all_ready):
                     return
                 watch.word = conductor.headline()
             elif watch.source_ended:
@@ -277,6 +278,15 @@ class Run:
         console.print(f"treedock: {closing_line(values)}", highlight=False, soft_wrap=True)
         for line in mission_lines(values):
             console.print(f"treedock: {line}", highlight=False, soft_wrap=True)
+
+
+def _world_lost(supervisor: Supervisor) -> str:
+    """Return what became of the simulator when it died: another one is another world, and its time begins anew."""
+    child = supervisor.children.get("simulator")
+    lost = child is not None and child.was_ready and child.restarts > 0
+    return (
+        f"the simulator {child.last_fault}: with it aircraft and world are gone" if child is not None and lost else ""
+    )
 
 
 def _stopped(stop: StopSignal) -> int:

@@ -23,6 +23,7 @@ from services.common.errors import InputError
 from services.common.stop import StopSignal
 from services.evaluate.flown import mission_figures
 from services.simulator.catalogue import scene_for, trees_to_ask_for
+from tests.unit.test_common_supervisor import Bench
 
 
 def _tree(**simulator: object) -> TreedockConfig:
@@ -147,3 +148,24 @@ def test_handheld_starts_without_a_vehicle_and_ends_with_the_pictures(monkeypatc
     late = Conductor(watch, 60.0, handheld=True)
     assert late.update(ready=False)
     assert "ended before" in late.word
+
+
+def test_a_mission_whose_simulator_died_ends_and_says_so() -> None:
+    """Its time begins anew and nobody's clock runs back: the run would stand still until its time was up."""
+    supervisor = Bench("router", "simulator")
+    supervisor.after(0.0)
+    supervisor.ready("simulator")
+    supervisor.spawned[1].code = -9
+    supervisor.after(0.1)
+    told = SimpleNamespace(word="", update=lambda **_: False, headline=lambda: "")
+    made = object.__new__(Run)
+    watch = SimpleNamespace(pump=lambda _: supervisor.after(0.1), word="")
+    looks: list[int] = []
+
+    def show() -> None:
+        looks.append(1)
+        assert len(looks) < 20, "it goes on without a world"
+
+    made._watch_over(supervisor.supervisor, watch, show, StopSignal(), told)  # type: ignore[arg-type]
+    assert "simulator" in told.word
+    assert "SIGKILL" in told.word

@@ -40,7 +40,8 @@ commands given, whether the last start command is refused when it is sent once m
 not after, and that a mission that ended says why and left the aircraft disarmed. A process that was killed or stopped must
 be back and READY within 3.5 s of its end, and no other process may have been started again.
 
-The simulator is no row: it is the aircraft and the world, and there is nothing to hold when they are gone.
+The simulator is no row: it is the aircraft and the world, and there is nothing to hold when they are gone. `treedock run` then
+ends with that reason (`test_a_mission_whose_simulator_died_ends_and_says_so`).
 """
 
 
