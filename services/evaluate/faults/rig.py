@@ -27,6 +27,7 @@ from services.evaluate.faults.flown import Flown
 ONBOARD = ("router", "recorder", "camera", "slam", "mapper", "detector", "refiner", "navigator", "autopilot")
 STANDINS = frozenset({"slam", "mapper", "detector", "refiner"})
 _LOOK_S = 0.02
+_ROUTER_WITHIN_S = 240.0
 _READY = frozenset({"ready", "degraded"})
 
 
@@ -96,7 +97,9 @@ class Rig:
     def __enter__(self) -> Self:
         try:
             self.supervisor.check()
-            session = self._stack.enter_context(opened_client(self.config.router.endpoint, lambda: False, wait_s=60.0))
+            session = self._stack.enter_context(
+                opened_client(self.config.router.endpoint, lambda: False, _ROUTER_WITHIN_S)
+            )
             self.bus = Bus(session, self.config.uav, HealthBook())
             self.bus.subscribe(HEALTH, self._on_health)
             self.flown.listen(self.bus)
