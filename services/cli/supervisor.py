@@ -58,6 +58,8 @@ class Child:
     """Without having become ready in between."""
     start_at_s: float = 0.0
     last_fault: str = ""
+    killed: bool = False
+    """By us; a process that the kernel holds ends some time later."""
     was_ready: bool = False
     """At any time: what it is started with was good once."""
 
@@ -116,9 +118,9 @@ class Supervisor:
             code = child.process.poll()
             if code is not None:
                 self._died(child, code)
-            elif reason := self._hung(child):
+            elif not child.killed and (reason := self._hung(child)):
                 LOG.warning("%s (pid %d) %s: it is killed and started again", child.name, child.process.pid, reason)
-                child.last_fault = reason
+                child.last_fault, child.killed = reason, True
                 child.process.send_signal(signal.SIGKILL)
 
     def _held_back(self, child: Child) -> bool:
@@ -157,7 +159,7 @@ class Supervisor:
         return f"was silent for {silent_s:.0f} s" if silent_s > self.limits.hung_after_s else ""
 
     def _died(self, child: Child, code: int) -> None:
-        child.process = None
+        child.process, child.killed = None, False
         child.last_fault = _words(code)
         child.deaths_in_a_row += 0 if child.ready else 1
         child.ready = False

@@ -18,6 +18,8 @@ class FakeProcess:
     pid: int
     code: int | None = None
     stubborn: bool = False
+    undying: bool = False
+    """Held by the kernel: not even a SIGKILL ends it at once."""
     signals: list[int] = field(default_factory=list)
 
     def poll(self) -> int | None:
@@ -25,7 +27,7 @@ class FakeProcess:
 
     def send_signal(self, sig: int) -> None:
         self.signals.append(sig)
-        if sig == signal.SIGKILL or not self.stubborn:
+        if not self.undying and (sig == signal.SIGKILL or not self.stubborn):
             self.code = -sig
 
     def wait(self, timeout: float | None = None) -> int:
@@ -206,3 +208,18 @@ def test_no_flight_ends_because_the_recorder_cannot_be_had_back() -> None:
         bench.after(0.1)
     assert bench.supervisor.given_up is None
     assert len(bench.spawned) > LIMITS.give_up_after, "it is tried again and again"
+
+
+def test_a_process_that_takes_long_to_die_is_killed_once() -> None:
+    bench = Bench("slam")
+    bench.after(0.0)
+    bench.ready("slam")
+    process = bench.spawned[0]
+    process.undying = True
+    for _ in range(70):
+        bench.after(0.1)
+    assert process.signals == [signal.SIGKILL]
+    process.code = -9
+    bench.after(0.1)
+    bench.after(0.6)
+    assert len(bench.spawned) == 2
