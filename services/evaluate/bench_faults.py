@@ -32,7 +32,7 @@ def run(options: BenchOptions) -> BenchReport:
     path = options.out / "faults.jsonl"
     found = []
     with tempfile.TemporaryDirectory(prefix="treedock-faults-") as folder:
-        bench = Bench(seed, Path(folder), moments=moments, tell=options.tell)
+        bench = Bench(seed, Path(folder), fresh_seed=options.seed, moments=moments, tell=options.tell)
         try:
             for row in wanted(options.scenes):
                 key = json.dumps({"row": row.name, "seed": seed, "moments": moments, "code": version})

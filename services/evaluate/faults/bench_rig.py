@@ -30,6 +30,8 @@ class Bench:
     seed: int
     folder: Path
     limits: Limits = field(default_factory=Limits)
+    fresh_seed: int | None = None
+    """Of the recording; None: the named scene."""
     moments: int = 3
     """How often each process is harmed in a row."""
     tell: Callable[[str], None] = lambda _: None
@@ -70,7 +72,7 @@ class Bench:
         from services.evaluate.faults.chain import Chain
 
         if self._chain is None:
-            self._chain = self._stack.enter_context(Chain.over_a_recording(self.seed, self.folder, self.tell))
+            self._chain = self._stack.enter_context(Chain.over_a_recording(self.fresh_seed, self.folder, self.tell))
         return self._chain
 
     def close(self) -> None:

@@ -42,8 +42,8 @@ class Chain:
     poses: list[Pose] = field(default_factory=list)
 
     @classmethod
-    def over_a_recording(cls, seed: int, folder: Path, tell: Callable[[str], None]) -> Chain:
-        """Render a scene of ``seed`` (or take it up) and make the chain over it."""
+    def over_a_recording(cls, seed: int | None, folder: Path, tell: Callable[[str], None]) -> Chain:
+        """Render a scene of ``seed``, the named one without (or take up what was rendered), and make the chain over it."""
         options = BenchOptions(seed=seed, out=folder.parent / "treedock-faults-recordings", tell=tell)
         _, frames = frames_for(options)
         return cls(Rig(live_config(folder / "chain"), folder / "chain", SERVICES, standins=frozenset()), frames)
