@@ -56,9 +56,10 @@ def die_with_parent() -> None:
 
 
 def give_way(nice: int) -> None:
-    """Let the calling thread run after others where the processor is short (Linux: niceness is per thread).
+    """Let the calling thread run after others of its program where the processor is short (Linux: niceness is per thread).
 
     A sandbox may forbid it: the work is done all the same, only not last.
     """
     with contextlib.suppress(PermissionError):
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), nice)
+        me = threading.get_native_id()
+        os.setpriority(os.PRIO_PROCESS, me, min(os.getpriority(os.PRIO_PROCESS, me) + nice, 19))
