@@ -14,7 +14,7 @@ from schemas.camera import Intrinsics, RgbdFrame
 from schemas.topics import CAMERA_RGBD
 from services.common.config import load_config
 from services.common.context import Context
-from services.common.process import prepare_process
+from services.common.process import die_with_parent, prepare_process
 from services.common.runtime import run_service
 
 
@@ -58,7 +58,8 @@ class Listener:
 
 
 def main() -> int:
-    """Run until stopped."""
+    """Run until stopped, or until the benchmark that started this ends."""
+    die_with_parent()
     role, config, out, width, height, rate_hz = sys.argv[1:7]
 
     def build(context: Context) -> object:

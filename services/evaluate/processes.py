@@ -30,7 +30,7 @@ class Processes:
 
     def start(self, name: str) -> None:
         """Start a service."""
-        self.spawn(name, "services.cli.app", name, "--config", str(self.config_file))
+        self.spawn(name, "services.cli.app", name, "--config", str(self.config_file), "--parent", str(os.getpid()))
 
     def spawn(self, name: str, module: str, *arguments: str) -> None:
         """Start ``python -m module arguments`` under a name."""
