@@ -17,8 +17,9 @@ from services.detector.checks import (
 from services.detector.config import DetectorConfig
 from services.detector.cylinders import Cylinder, fit_cylinder, fit_from
 from services.detector.facing import LONGEST_M, common_eye
-from services.detector.forks import Arm, Fork, find_forks
+from services.detector.forks import Arm
 from services.detector.halves import both_halves
+from services.detector.joining import Candidate, join_forks, rejection
 from services.detector.model import Floats, Ground, Rejection, Trunk, Views
 from services.detector.stacks import Stack
 from services.detector.upright import Floats32, Upright
@@ -48,24 +49,12 @@ class Surroundings:
     """(3,) upright frame: from where all was seen, where that is inferred."""
 
 
-@dataclass(frozen=True, slots=True)
-class Candidate:
-    """A cylinder that passed the checks; heights above the ground at its base."""
-
-    cylinder: Cylinder
-    base: Floats
-    low_m: float
-    high_m: float
-    top_m: float
-    fork_m: float | None = None
-    """Height of the fork, where it is one tree of two arms."""
-
-
 def judge(stacks: list[Stack], around: Surroundings) -> tuple[list[Trunk], list[Rejection]]:
     """Return the trunks, sorted by distance from the input's origin in the plan, and what was dropped and why."""
     kept: list[Candidate] = []
     rejections: list[Rejection] = []
     unsure: list[Arm] = []
+    dropped: list[Arm] = []
     fits = _fits(stacks, around)
     if not around.voxels.seen_from:
         around = _look_again(stacks, fits, around)
@@ -73,11 +62,12 @@ def judge(stacks: list[Stack], around: Surroundings) -> tuple[list[Trunk], list[
         found = _examine(stack, cylinder, kept, around)
         if isinstance(found, Rejection):
             rejections.append(found)
+            dropped.append(Arm.of_stack(stack))
             if found.reason == _NO_CYLINDER and stack.layers >= _ARM_LAYERS:
                 unsure.append(Arm.of_stack(stack))
         else:
             kept.append(found)
-    kept, joined = _join_forks(kept, unsure, around)
+    kept, joined = join_forks(kept, unsure, dropped, around.frame, around.ground)
     rejections.extend(joined)
     trunks = [_as_trunk(c, around) for c in kept]
     trunks.sort(key=lambda t: (np.hypot(t.base_m[0], t.base_m[1]), t.base_m))
@@ -141,7 +131,7 @@ def _examine(
 ) -> Candidate | Rejection:
     config = around.config
     if cylinder is None:
-        return _rejection(stack.at_m, stack.radius_m, stack.layers, _NO_CYLINDER, around.frame)
+        return rejection(stack.at_m, stack.radius_m, stack.layers, _NO_CYLINDER, around.frame)
     base = base_point(cylinder, around.ground)
     low, high = cylinder.z_low_m - base[2], cylinder.z_high_m - base[2]
     top = high
@@ -151,13 +141,8 @@ def _examine(
         top = z_top - base[2]
         reason = _post_fault(cylinder, top, z_top, around)
     if reason:
-        return _rejection(base, cylinder.radius_m, stack.layers, reason, around.frame)
+        return rejection(base, cylinder.radius_m, stack.layers, reason, around.frame)
     return Candidate(cylinder, base, low, high, top)
-
-
-def _rejection(at: Floats, radius: float, layers: int, reason: str, frame: Upright) -> Rejection:
-    x, y, z = (float(v) for v in frame.to_input(at))
-    return Rejection(x, y, z, radius, layers, reason)
 
 
 def _post_fault(cylinder: Cylinder, top_m: float, z_top: float, around: Surroundings) -> str:
@@ -178,48 +163,6 @@ def _twin_fault(cylinder: Cylinder, kept: list[Candidate]) -> str:
         if d < max(other.cylinder.radius_m, cylinder.radius_m) + 0.3 * min(other.cylinder.radius_m, cylinder.radius_m):
             return "the same trunk as a better candidate"
     return ""
-
-
-def _join_forks(
-    kept: list[Candidate], unsure: list[Arm], around: Surroundings
-) -> tuple[list[Candidate], list[Rejection]]:
-    """Make one tree of each pair of arms; arms above a stem that is a candidate itself are dropped."""
-    gone: set[int] = set()
-    joined: list[Rejection] = []
-    merged: list[Candidate] = []
-    arms = [Arm.of_cylinder(c.cylinder) for c in kept] + unsure
-    for fork in find_forks(arms, len(kept), around.ground):
-        if fork.first in gone or fork.second in gone:
-            continue
-        pair = [k for k in (fork.first, fork.second) if k < len(kept)]
-        gone.update((fork.first, fork.second))
-        stem = next((k for k, c in enumerate(kept) if k not in pair and _stands_below(c, fork)), None)
-        for k in pair if stem is not None else pair[1:]:
-            c = kept[k].cylinder
-            reason = f"an arm of a tree that forks {fork.height_m:.1f} m above ground"
-            joined.append(
-                _rejection(kept[k].base, c.radius_m, round((c.z_high_m - c.z_low_m) / 0.1), reason, around.frame)
-            )
-        if stem is None:
-            axis = arms[fork.first].axis + arms[fork.second].axis
-            merged.append(_forked([kept[k] for k in pair], axis / np.linalg.norm(axis), fork, around.ground))
-    return [c for k, c in enumerate(kept) if k not in gone] + merged, joined
-
-
-def _stands_below(candidate: Candidate, fork: Fork) -> bool:
-    at = axis_at(candidate.cylinder, float(fork.at_m[2]))
-    below = candidate.cylinder.z_high_m < fork.at_m[2] + 0.4
-    return below and float(np.linalg.norm(at[:2] - fork.at_m[:2])) < candidate.cylinder.radius_m + 0.05
-
-
-def _forked(arms: list[Candidate], axis: Floats, fork: Fork, ground: Ground) -> Candidate:
-    """Return one tree of its arms: it stands below the fork, as thick as the thickest arm."""
-    thick = max(arms, key=lambda c: c.cylinder.radius_m)
-    base = np.array([fork.at_m[0], fork.at_m[1], ground.height_m(float(fork.at_m[0]), float(fork.at_m[1]))])
-    return replace(
-        thick, cylinder=replace(thick.cylinder, axis=axis), base=base, fork_m=max(fork.height_m, 0.0),
-        low_m=min(c.low_m for c in arms), high_m=max(c.high_m for c in arms), top_m=max(c.top_m for c in arms),
-    )  # fmt: skip
 
 
 def _as_trunk(candidate: Candidate, around: Surroundings) -> Trunk:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,10 @@ import numpy as np
 from services.detector.cylinders import Cylinder
 from services.detector.model import Floats, Ground
 from services.detector.stacks import Stack
+
+_MIN_ANGLE_RAD = 0.14
+_SEEN_FROM_M = 0.3
+"""An arm begins at least so far above where its stem is seen to begin."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,17 +24,18 @@ class Arm:
     axis: Floats
     radius_m: float
     z_low_m: float
+    z_high_m: float
 
     @classmethod
     def of_cylinder(cls, c: Cylinder) -> Arm:
         """Return the arm of a fitted cylinder."""
-        return cls(c.at_m, c.axis, c.radius_m, c.z_low_m)
+        return cls(c.at_m, c.axis, c.radius_m, c.z_low_m, c.z_high_m)
 
     @classmethod
     def of_stack(cls, s: Stack) -> Arm:
         """Return the arm that a line of slices shows."""
         axis = np.array([s.slope[0], s.slope[1], 1.0])
-        return cls(s.at_m, axis / np.linalg.norm(axis), s.radius_m, s.z_low_m)
+        return cls(s.at_m, axis / np.linalg.norm(axis), s.radius_m, s.z_low_m, s.z_high_m)
 
     def point(self, z_m: float) -> Floats:
         """Return the axis point (3,) at a height."""
@@ -59,7 +65,30 @@ def _closest(a: Arm, b: Arm) -> tuple[float, float]:
     return z, float(np.linalg.norm(apart + spread * z))
 
 
-def find_forks(arms: list[Arm], sure: int, ground: Ground, min_angle_rad: float = 0.14) -> list[Fork]:
+def _angle(a: Arm, b: Arm) -> float:
+    return float(np.arccos(min(1.0, float(a.axis @ b.axis))))
+
+
+def find_stem(arm: Arm, below: Sequence[Arm]) -> tuple[int, float] | None:
+    """Return which axis is the stem that an arm grows from, and the height z where the two meet; None when it stands alone.
+
+    A single leaning trunk is seen down to where slicing begins, or what hides it there is no stem. Where another axis stands
+    under the arm's lower end, meets it and points elsewhere, the arm is a fork's, though its fellow is hidden.
+    """
+    for k, stem in enumerate(below):
+        middle = 0.5 * (stem.z_low_m + stem.z_high_m)
+        if arm.z_low_m < max(stem.z_low_m + _SEEN_FROM_M, middle) or _angle(arm, stem) < _MIN_ANGLE_RAD:
+            continue
+        if not 0.7 < stem.radius_m / arm.radius_m < 2.5:
+            continue
+        z = float(np.clip(_closest(arm, stem)[0], stem.z_low_m, max(stem.z_high_m, arm.z_low_m)))
+        apart = float(np.linalg.norm((arm.point(z) - stem.point(z))[:2]))
+        if apart < 0.5 * (arm.radius_m + stem.radius_m) + 0.02:
+            return k, z
+    return None
+
+
+def find_forks(arms: list[Arm], sure: int, ground: Ground) -> list[Fork]:
     """Return pairs of arms: axes at an angle that meet below both arms, between a little under ground and 2 m above.
 
     Only the first ``sure`` arms are trunks; the others can be the second arm of one of those. Trees that merely stand close have axes that pass each other, or meet far below the ground.
@@ -70,7 +99,7 @@ def find_forks(arms: list[Arm], sure: int, ground: Ground, min_angle_rad: float 
             b = arms[j]
             if not 0.5 < a.radius_m / b.radius_m < 2.0:
                 continue
-            if float(np.arccos(min(1.0, float(a.axis @ b.axis)))) < min_angle_rad:
+            if _angle(a, b) < _MIN_ANGLE_RAD:
                 continue
             z, distance = _closest(a, b)
             if distance > 0.5 * (a.radius_m + b.radius_m) + 0.02 or z > min(a.z_low_m, b.z_low_m) + 0.25:

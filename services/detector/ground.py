@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from services.detector import ground_kernels as kernels
 from services.detector import ground_surface as surface
 from services.detector.halves import both_halves, half_of
-from services.detector.model import Ground
+from services.detector.model import Floats, Ground
 from services.detector.upright import Upright
 
 Ints32 = NDArray[np.int32]
@@ -51,9 +51,7 @@ def find_ground(frame: Upright, cell_m: float) -> GroundedCloud:
     kernels.choose_lows(frame.xyz_m, at, counts, cell_points, valid)
     kernels.drop_pits(cell_points, valid)
     kernels.drop_hanging(cell_points, valid, cell)
-    kernels.drop_above_wide_plane(cell_points, valid, x0, y0, cell)
-    planes = np.zeros((nx, ny, 3))
-    kernels.fit_planes(cell_points, valid, counts, x0, y0, cell, planes)
+    planes = _planes(cell_points, valid, counts, (x0, y0, cell))
     lowest = Ground(x0, y0, cell, planes, seen=True, note="ground seen")
     bins, low, mid = _surface(frame, cell_of, lowest)
     if low > 1.5 * mid and low >= 50:
@@ -77,6 +75,17 @@ def _lows(frame: Upright, x0: float, y0: float, cell: float, nx: int, ny: int) -
     both_halves(work, n)
     kernels.merge_lows(lows[0], at[0], counts[0], lows[1], at[1], counts[1])
     return cell_of, at[0], counts[0]
+
+
+def _planes(cell_points: Floats, valid: NDArray[np.bool_], counts: Ints32, grid: tuple[float, float, float]) -> Floats:
+    """Return a plane per cell (nx, ny, 3), without the cells that stand above their wider surroundings."""
+    nx, ny = valid.shape
+    drop, planes = np.zeros((nx, ny), dtype=np.bool_), np.zeros((nx, ny, 3))
+    many = 40 * nx * ny
+    both_halves(lambda half: kernels.above_wide_plane(cell_points, valid, *grid, half, drop), many)
+    valid &= ~drop
+    both_halves(lambda half: kernels.fit_planes(cell_points, valid, counts, *grid, half, planes), many)
+    return planes
 
 
 def _surface(frame: Upright, cell_of: Ints32, ground: Ground) -> tuple[Ints32, int, int]:

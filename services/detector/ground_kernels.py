@@ -194,13 +194,17 @@ def _plane_at(cell_points: Floats, valid: Bools, a: int, b: int, half: int, xc: 
 
 
 @njit(cache=True, nogil=True)
-def drop_above_wide_plane(cell_points: Floats, valid: Bools, x0: float, y0: float, cell: float) -> None:
-    """Drop cells well above the plane of their wider surroundings: a trunk or bush whose own ground was never seen."""
+def above_wide_plane(
+    cell_points: Floats, valid: Bools, x0: float, y0: float, cell: float, half_of_rows: int, drop: Bools
+) -> None:
+    """Mark cells well above the plane of their wider surroundings: a trunk or bush whose own ground was never seen.
+
+    Every second row of planes is one half's, the others the other's.
+    """
     nx, ny = valid.shape
     plane = np.zeros(3)
-    drop = np.zeros((nx, ny), dtype=np.bool_)
     half = max(2, int(np.ceil(3.0 / cell)))
-    for a in range(1, nx + 1, _LATTICE):
+    for a in range(1 + half_of_rows * _LATTICE, nx + 1, 2 * _LATTICE):
         for b in range(1, ny + 1, _LATTICE):
             a0, b0 = min(a, nx - 1), min(b, ny - 1)
             xc, yc = x0 + (a0 + 0.5) * cell, y0 + (b0 + 0.5) * cell
@@ -215,17 +219,23 @@ def drop_above_wide_plane(cell_points: Floats, valid: Bools, x0: float, y0: floa
                     e = cell_points[i, j, 2] - plane[0] - plane[1] * (cell_points[i, j, 0] - xc)
                     e -= plane[2] * (cell_points[i, j, 1] - yc)
                     drop[i, j] = e > 0.25
-    for a in range(nx):
-        for b in range(ny):
-            if drop[a, b]:
-                valid[a, b] = False
 
 
 @njit(cache=True, nogil=True)
 def fit_planes(
-    cell_points: Floats, valid: Bools, counts: Ints32, x0: float, y0: float, cell: float, planes: Floats
+    cell_points: Floats,
+    valid: Bools,
+    counts: Ints32,
+    x0: float,
+    y0: float,
+    cell: float,
+    half_of_rows: int,
+    planes: Floats,
 ) -> None:
-    """Write a plane per cell that has points near it, from the valid cells around; the lowest height elsewhere."""
+    """Write a plane per cell that has points near it, from the valid cells around; the lowest height elsewhere.
+
+    Every second row is one half's, the others the other's.
+    """
     nx, ny = valid.shape
     whole = np.zeros(3)
     lowest = 1e30
@@ -233,7 +243,7 @@ def fit_planes(
         for b in range(ny):
             if valid[a, b]:
                 lowest = min(lowest, cell_points[a, b, 2])
-    for a in range(nx):
+    for a in range(half_of_rows, nx, 2):
         for b in range(ny):
             xc = x0 + (a + 0.5) * cell
             yc = y0 + (b + 0.5) * cell

@@ -171,6 +171,30 @@ def keyframe_points(name: str, cache: Path) -> tuple[NDArray[np.float32], Views]
     return np.concatenate(points), views
 
 
+def raw_points(name: str, cache: Path, count: int) -> tuple[NDArray[np.float32], Views]:
+    """Return ``count`` points of a scene's first keyframes as the sensor gave them, 0.5 to 6 m away, each with its view."""
+    from services.mapper.cloud import pixel_rays
+    from services.simulator.render import DEFAULT_INTRINSICS
+
+    shots = _cached_shots(name, cache)
+    rays = pixel_rays(DEFAULT_INTRINSICS).astype(np.float64).reshape(-1, 2)
+    directions = np.column_stack([rays, np.ones(len(rays))])
+    points, index, have = [], [], 0
+    for k, (image, T) in enumerate(zip(shots.depth, shots.poses, strict=True)):
+        depth = image.astype(np.float64).reshape(-1, 1) * 0.001
+        near = ((depth > 0.5) & (depth < 6.0))[:, 0]
+        local = (depth * directions)[near]
+        points.append((local @ T[:3, :3].T + T[:3, 3]).astype(np.float32))
+        index.append(np.full(len(local), k, dtype=np.int32))
+        have += len(local)
+        if have >= count:
+            break
+    views = Views(
+        np.concatenate(index)[:count], shots.poses[:, :3, 3].copy(), shots.poses[:, :3, :3].copy(), (0.64, 0.48)
+    )
+    return np.concatenate(points)[:count], views
+
+
 def wrong_poses(poses: Floats, drift: Drift, seed: int) -> Floats:
     """Return poses (K, 4, 4) with a lean of the whole map, a slow wandering and white noise."""
     rng = np.random.default_rng([seed, 707])

@@ -14,6 +14,7 @@ from services.detector.map_store import MapStore
 from services.detector.model import Views
 from services.evaluate.bench import BenchOptions
 from services.evaluate.bench_peers import PeerCloud, Stem
+from services.evaluate.detection_clouds import keyframe_points, scene_cloud
 from services.evaluate.ring import fit_centre
 
 _NAN = float("nan")
@@ -70,6 +71,16 @@ def _make(name: str, file: Path, options: BenchOptions) -> None:
         rotations=views.rotations if views.rotations is not None else np.zeros((0, 3, 3)), tan=views.tan_half or (0.0, 0.0),
         fair=_at_breast(fair), unfair=_at_breast(unfair),
     )  # fmt: skip
+
+
+def whole_cloud(name: str, options: BenchOptions) -> PeerCloud:
+    """Return all points of the scene's keyframes at their true poses, full resolution, nothing thinned; and its trees."""
+    cache = options.out / "detection"
+    points, views = keyframe_points(name, cache)
+    trees = scene_cloud(name, cache).trees
+    fair = [t for t in trees if t.fair and t.suitable]
+    unfair = [t for t in trees if not (t.fair and t.suitable)]
+    return PeerCloud(f"{name}-whole", points.astype(np.float64), _at_breast(fair), views, ignored=_at_breast(unfair))
 
 
 def _stems(rows: NDArray[np.float64]) -> tuple[Stem, ...]:

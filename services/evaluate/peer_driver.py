@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import importlib
 import importlib.machinery
+import inspect
 import json
 import sys
 import time
 import types
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -21,39 +23,52 @@ Rows = list[list[float]]
 """x, y, radius of each stem."""
 
 
-_VERTICALITY: tuple[dict[str, float], ...] = (
-    {},
-    {"n_points": 100, "resolution_xy": 0.04, "resolution_z": 0.04},
-    {"scale": 0.25, "vert_threshold": 0.6, "n_points": 300},
-    {"scale": 0.25, "vert_threshold": 0.6, "n_points": 60, "resolution_xy": 0.05, "resolution_z": 0.05},
-)
-"""Settings of dendromatics' test of verticality: the defaults; fewer and wider apart, for thinned clouds; wider and laxer, which
-the noise of a camera's cloud needs. The first with which it finds anything counts."""
+DENDROMATICS: dict[str, dict[str, float]] = {
+    "3DFin's defaults": {},
+    "for thinned clouds of one side": {"n_points": 150, "section_points": 30, "sectors": 5},
+    "and for noise": {
+        "n_points": 150, "section_points": 30, "sectors": 5, "scale": 0.2, "threshold": 0.6, "voxel_m": 0.03,
+    },
+}  # fmt: skip
+"""Settings of 3DFin, dendromatics' own application; what differs from its defaults. The second: fewer points a stem and a section, and
+5 of 16 sectors instead of 9, since a camera sees less than half of a trunk. The third: wider and laxer verticality as well."""
+_SECTIONS_M = (0.3, 25.0, 0.2)
+_STRIPE_M = (0.7, 3.5)
 
 
-def dendromatics(points: Floats) -> Rows:
-    """Find stems as the package's documentation chains its functions."""
-    for settings in _VERTICALITY:
-        try:
-            rows = _dendromatics(points, **settings)
-        except (ValueError, IndexError):  # its way of saying that no cluster was a stem
-            continue
-        if rows:
-            return rows
-    return []
-
-
-def _dendromatics(points: Floats, **verticality: float) -> Rows:
+def dendromatics(points: Floats, settings: str) -> Rows:
+    """Find stems as 3DFin drives the package: its order of steps, its defaults (abstract_processing.py, configuration.py)."""
     dm = importlib.import_module("dendromatics")
-    cloth = dm.clean_cloth(dm.generate_dtm(dm.clean_ground(points)))
-    heights = dm.normalize_heights(points, cloth)
+    own = {
+        "n_points": 1000,
+        "section_points": 80,
+        "sectors": 9,
+        "scale": 0.1,
+        "threshold": 0.7,
+        "voxel_m": 0.02,
+    } | DENDROMATICS[settings]
+    terrain = dm.clean_cloth(dm.generate_dtm(dm.clean_ground(points), cloth_resolution=0.7))
+    heights = dm.normalize_heights(points, terrain)
     cloud = np.column_stack([points, heights])
-    stripe = cloud[(heights > 0.7) & (heights < 3.5)]
-    clustered = dm.verticality_clustering(stripe, **verticality)
-    trees, vectors = dm.individualize_trees(cloud, clustered)[:2]
-    sections = np.arange(0.3, 3.0, 0.2)
-    x, y, radius, _, occupied = dm.compute_sections(trees, sections)[:5]
-    outliers = dm.tilt_detection(x, y, radius, sections)
+
+    def upright(part: Floats) -> Floats:
+        return dm.verticality_clustering(
+            part, own["scale"], own["threshold"], int(own["n_points"]), 2, own["voxel_m"], own["voxel_m"], 5
+        )  # fmt: skip
+
+    stripe = upright(cloud[(heights > _STRIPE_M[0]) & (heights < _STRIPE_M[1])])
+    assigned, vectors = dm.individualize_trees(
+        cloud, stripe, resolution_z=0.035, resolution_xy=0.035, stripe_lower_limit=_STRIPE_M[0], stripe_upper_limit=_STRIPE_M[1],
+        h_range=0.7, d_max=15.0, min_points=20, d=1.5, max_dev=25.0, resolution_heights=0.3,
+    )[:2]  # fmt: skip
+    low, high, step = _SECTIONS_M
+    stems = upright(assigned[(assigned[:, 5] < 1.0) & (assigned[:, 3] > low) & (assigned[:, 3] < high)])[:, :6]
+    sections = np.arange(low, min(high, float(heights.max()) + step), step)
+    x, y, radius, _, _, occupied, _ = dm.compute_sections(
+        stems, sections, section_width=0.05, R_min=0.03, R_max=0.5, n_points_section=int(own["section_points"]),
+        min_n_sectors=int(own["sectors"]), width=0.02,
+    )  # fmt: skip
+    outliers = dm.tilt_detection(x, y, radius, sections, w_1=3, w_2=1)
     diameters, places = dm.tree_locator(sections, x, y, vectors, occupied, radius, outliers)
     rows = []
     for place, diameter, found in zip(places, np.ravel(diameters), radius, strict=True):
@@ -63,11 +78,19 @@ def _dendromatics(points: Floats, **verticality: float) -> Rows:
     return rows
 
 
-def treex(points: Floats) -> Rows:
-    """Find stems with treeX of pointtree, default preset, crowns included: they are part of the one call."""
+TREEX = ("TreeXPreset", "TreeXPresetOriginal", "TreeXPresetULS")
+"""The author's presets: default (which is the one for terrestrial scans), the paper's, and for sparser clouds."""
+
+
+def treex(points: Floats, settings: str) -> Rows:
+    """Find stems with treeX of pointtree, crowns included: they are part of the one call. Our clouds carry no intensity."""
     for name in ("torch", "torch.utils", "torch.utils.data", "torch_scatter", "torch_cluster"):
         _stand_in(name)
-    algorithm = importlib.import_module("pointtree.instance_segmentation").TreeXAlgorithm()
+    package = importlib.import_module("pointtree.instance_segmentation")
+    presets = importlib.import_module("pointtree.instance_segmentation.tree_x_presets")
+    own = dict(getattr(presets, settings)()) | {"stem_search_min_cluster_intensity": None}
+    known = inspect.signature(package.TreeXAlgorithm.__init__).parameters
+    algorithm = package.TreeXAlgorithm(**{key: value for key, value in own.items() if key in known})
     _, places, diameters = algorithm(np.ascontiguousarray(points, dtype=np.float64))
     return [[float(x), float(y), float(d) / 2] for (x, y), d in zip(places, diameters, strict=True)]
 
@@ -89,24 +112,28 @@ def _stand_in(name: str) -> None:
     sys.modules[name] = module
 
 
-PEERS = {"dendromatics": dendromatics, "treex": treex}
+PEERS = {"dendromatics": (dendromatics, tuple(DENDROMATICS)), "treex": (treex, TREEX)}
 
 
 def main(name: str, cloud: str, out: str) -> None:
-    """Run a peer twice (the first call compiles and loads) and write its stems and the seconds of both."""
+    """Run a peer with each of its settings; write what each found, its seconds and its fault, as far as it came."""
     points = np.load(cloud)["points_m"]
-    spent, rows, fault = [], [], ""
-    for _ in range(2):
+    find, all_settings = PEERS[name]
+    runs: list[dict[str, object]] = []
+    find_or_fault(find, points[:: max(1, len(points) // 20_000)], all_settings[0])  # the first call compiles and loads
+    for settings in all_settings:
         begin = time.perf_counter()
-        try:
-            rows = PEERS[name](points.copy())
-        except Exception as error:  # noqa: BLE001 - a peer may fail on a cloud in any way: that is its result
-            fault = f"{type(error).__name__}: {error}"
-            rows = []
-        spent.append(time.perf_counter() - begin)
-        if fault or spent[0] > 60.0:
-            break
-    Path(out).write_text(json.dumps({"stems": rows, "seconds": spent, "fault": fault}))
+        rows, fault = find_or_fault(find, points.copy(), settings)
+        runs.append({"settings": settings, "stems": rows, "seconds": time.perf_counter() - begin, "fault": fault})
+        Path(out).write_text(json.dumps(runs))
+
+
+def find_or_fault(find: Callable[[Floats, str], Rows], points: Floats, settings: str) -> tuple[Rows, str]:
+    """Return a peer's stems; or none and its fault: it may fail on a cloud in any way, and that is its result."""
+    try:
+        return find(points, settings), ""
+    except Exception as error:  # noqa: BLE001
+        return [], f"{type(error).__name__}: {error}"
 
 
 if __name__ == "__main__":
