@@ -15,9 +15,9 @@ from services.detector.checks import (
     space_above_was_seen,
 )
 from services.detector.config import DetectorConfig
-from services.detector.cylinders import Cylinder, fit_cylinder, fit_from
+from services.detector.cylinders import MEAN_TAPER, Cylinder, fit_cylinder, fit_from
 from services.detector.facing import LONGEST_M, common_eye
-from services.detector.forks import Arm
+from services.detector.forks import BENT, Arm, Stem
 from services.detector.halves import both_halves
 from services.detector.joining import Candidate, join_forks, rejection
 from services.detector.model import Floats, Ground, Rejection, Trunk, Views
@@ -28,6 +28,8 @@ from services.detector.voxels import Voxels
 BREAST_HEIGHT_M = 1.3
 _EYE_HEIGHT_M = 1.4
 _NO_CYLINDER = "no cylinder through its slices"
+_LEAST_ON_LINE = 0.6
+_ODD_TAPER, _LEANS = 0.012, 0.1
 _ARM_LAYERS = 5
 """Slices that show a fork's second arm, though no cylinder could be fitted to it (the first stands in the way)."""
 
@@ -54,7 +56,7 @@ def judge(stacks: list[Stack], around: Surroundings) -> tuple[list[Trunk], list[
     kept: list[Candidate] = []
     rejections: list[Rejection] = []
     unsure: list[Arm] = []
-    dropped: list[Arm] = []
+    dropped: list[Stem] = []
     fits = _fits(stacks, around)
     if not around.voxels.seen_from:
         around = _look_again(stacks, fits, around)
@@ -62,7 +64,7 @@ def judge(stacks: list[Stack], around: Surroundings) -> tuple[list[Trunk], list[
         found = _examine(stack, cylinder, kept, around)
         if isinstance(found, Rejection):
             rejections.append(found)
-            dropped.append(Arm.of_stack(stack))
+            dropped.append(Stem(Arm.of_stack(stack), found.reason.endswith(BENT)))
             if found.reason == _NO_CYLINDER and stack.layers >= _ARM_LAYERS:
                 unsure.append(Arm.of_stack(stack))
         else:
@@ -135,7 +137,8 @@ def _examine(
     base = base_point(cylinder, around.ground)
     low, high = cylinder.z_low_m - base[2], cylinder.z_high_m - base[2]
     top = high
-    reason = shape_fault(cylinder, low, high, around.span_m, config) or _twin_fault(cylinder, kept)
+    reason = shape_fault(cylinder, low, high, around.span_m, config) or _bent_fault(stack, cylinder)
+    reason = reason or _twin_fault(cylinder, kept)
     if not reason:
         z_top = prolonged_top_m(cylinder, around.above_m, base[2] + config.look_high_m)
         top = z_top - base[2]
@@ -153,6 +156,16 @@ def _post_fault(cylinder: Cylinder, top_m: float, z_top: float, around: Surround
     if not seen and (around.eye_m is None or not seen_from_eye(free, around.eye_m, around.voxels, around.above_m)):
         return ""
     return f"ends {top_m:.1f} m above ground with free space seen above it: a post"
+
+
+def _bent_fault(stack: Stack, cylinder: Cylinder) -> str:
+    """Tell when one line was laid through a stem and an arm: slices between do not lie on it, and it leans or tapers oddly.
+
+    Trunks seen by a camera have 68 to 100 % of their slices on the line (162 of 70 simulated scenes).
+    """
+    straight = stack.cover >= _LEAST_ON_LINE or cylinder.range_m == 0.0
+    plain = abs(cylinder.taper - MEAN_TAPER) < _ODD_TAPER and float(np.hypot(*cylinder.axis[:2])) < _LEANS
+    return "" if straight or plain else f"{100 * stack.cover:.0f} % of its slices {BENT}"
 
 
 def _twin_fault(cylinder: Cylinder, kept: list[Candidate]) -> str:

@@ -23,7 +23,7 @@ _PRIOR_SLOPE = 0.02
 """Standard deviation of the lean left over after the stack's line was taken out, metres per metre."""
 _PRIOR_TAPER = 0.008
 """Standard deviation of the taper about its mean, metres of radius per metre of height."""
-_MEAN_TAPER = -0.006
+MEAN_TAPER = -0.006
 _CORRELATED = 12.0
 """Neighbouring points share fixed-pattern noise and bark: so many of them count as one in the covariance."""
 _HELD = 1e12
@@ -88,7 +88,7 @@ def _priors(radius: float, share: float = 1.0) -> Floats:
     slope = 1.0 / (4 * _PRIOR_SLOPE) ** 2
     return np.array([
         [0.0, 1e-6], [0.0, 1e-6], [0.0, slope], [0.0, slope], [radius, 1.0 / (share * (0.12 * radius + 0.006)) ** 2],
-        [_MEAN_TAPER, 1.0 / _PRIOR_TAPER**2],
+        [MEAN_TAPER, 1.0 / _PRIOR_TAPER**2],
     ])  # fmt: skip
 
 

@@ -11,6 +11,8 @@ from services.detector.cylinders import Cylinder
 from services.detector.model import Floats, Ground
 from services.detector.stacks import Stack
 
+BENT = "lie on one line: a fork, or a bush"
+"""How the reason ends for which a bent candidate is dropped."""
 _MIN_ANGLE_RAD = 0.14
 _SEEN_FROM_M = 0.3
 """An arm begins at least so far above where its stem is seen to begin."""
@@ -43,6 +45,15 @@ class Arm:
 
 
 @dataclass(frozen=True, slots=True)
+class Stem:
+    """A line of slices that is no trunk by itself and may be what an arm grows from."""
+
+    line: Arm
+    bent: bool
+    """Laid through a stem and an arm, so that it also runs beside the other arm."""
+
+
+@dataclass(frozen=True, slots=True)
 class Fork:
     """Where the axes of two arms meet, upright frame."""
 
@@ -69,14 +80,15 @@ def _angle(a: Arm, b: Arm) -> float:
     return float(np.arccos(min(1.0, float(a.axis @ b.axis))))
 
 
-def find_stem(arm: Arm, below: Sequence[Arm]) -> tuple[int, float] | None:
+def find_stem(arm: Arm, below: Sequence[Stem]) -> tuple[int, float] | None:
     """Return which axis is the stem that an arm grows from, and the height z where the two meet; None when it stands alone.
 
     A single leaning trunk is seen down to where slicing begins, or what hides it there is no stem. Where another axis stands
     under the arm's lower end, meets it and points elsewhere, the arm is a fork's, though its fellow is hidden.
     """
-    for k, stem in enumerate(below):
-        middle = 0.5 * (stem.z_low_m + stem.z_high_m)
+    for k, candidate in enumerate(below):
+        stem = candidate.line
+        middle = stem.z_low_m if candidate.bent else 0.5 * (stem.z_low_m + stem.z_high_m)
         if arm.z_low_m < max(stem.z_low_m + _SEEN_FROM_M, middle) or _angle(arm, stem) < _MIN_ANGLE_RAD:
             continue
         if not 0.7 < stem.radius_m / arm.radius_m < 2.5:

@@ -8,7 +8,7 @@ import numpy as np
 
 from services.detector.checks import axis_at
 from services.detector.cylinders import Cylinder
-from services.detector.forks import Arm, Fork, find_forks, find_stem
+from services.detector.forks import Arm, Fork, Stem, find_forks, find_stem
 from services.detector.model import Floats, Ground, Rejection
 from services.detector.upright import Upright
 
@@ -33,7 +33,7 @@ def rejection(at: Floats, radius: float, layers: int, reason: str, frame: Uprigh
 
 
 def join_forks(
-    kept: list[Candidate], unsure: list[Arm], dropped: list[Arm], frame: Upright, ground: Ground
+    kept: list[Candidate], unsure: list[Arm], dropped: list[Stem], frame: Upright, ground: Ground
 ) -> tuple[list[Candidate], list[Rejection]]:
     """Make one tree of each pair of arms, and of each arm on a stem; arms above a stem that is a tree itself are dropped.
 
@@ -61,7 +61,7 @@ def join_forks(
 
 
 def _on_stems(
-    kept: list[Candidate], dropped: list[Arm], frame: Upright, ground: Ground
+    kept: list[Candidate], dropped: list[Stem], frame: Upright, ground: Ground
 ) -> tuple[list[Candidate], list[Rejection]]:
     """Make a forked tree of each arm whose stem, too short for a trunk, was dropped; its second arm there goes."""
     out: list[Candidate] = []
@@ -73,7 +73,7 @@ def _on_stems(
             out.append(c)
             continue
         index, z = found
-        stem = dropped[index]
+        stem = dropped[index].line
         foot = stem.point(float(c.base[2]))
         base = np.array([foot[0], foot[1], ground.height_m(float(foot[0]), float(foot[1]))])
         height = max(z - float(base[2]), 0.0)
