@@ -48,7 +48,7 @@ class DetectorConfig(BaseModel):
     """By how much, per axis, what one keyframe shows of a trunk lies beside what another shows: poses, fixed pattern."""
     out_of_round: float = Field(default=0.026, ge=0.0)
     """Share of the radius by which the side that shows differs from the whole trunk; more points do not tell."""
-    off_centre: float = Field(default=0.030, ge=0.0)
+    off_centre: float = Field(default=0.025, ge=0.0)
     """The same for each coordinate of the axis: bark, flare and the pattern that the sensor repeats in every frame."""
     map_drift_m: float = Field(default=0.008, ge=0.0)
     """Error of the map itself per axis, as poses are slam's: no detection in that map can tell it. ``detect``: none."""

@@ -18,6 +18,9 @@ _AXES: tuple[tuple[Up, str], ...] = (
     ((-1.0, 0.0, 0.0), "x down"), ((0.0, 0.0, -1.0), "z down"),
 )  # fmt: skip
 _SAMPLE = 300_000
+_LEANS_RAD = 0.17
+"""Trunks of a whole cloud do not lean 10 degrees one way."""
+_AGREE = 3
 _BETTER = 1.5
 """z is left only for a direction that is so many times better."""
 
@@ -43,13 +46,54 @@ def find_vertical(points_m: NDArray[np.float64], config: DetectorConfig | None =
     result, up, name = looks[best]
     if scores[best] > 0.0:
         swapped = "" if up[2] == 1.0 else "the axes are swapped, "
-        return _found(result, up, f"{swapped}{name}: most trunks stand that way")
+        upright = _found(result, up, f"{swapped}{name}: most trunks stand that way")
+        return _tilted(sample, result, upright, config) or upright
     normal = ground_normal(sample)
     if normal is not None:
         result = detect_trees(sample, normal, None, config)
         if _score(result) > 0.0:
-            return _found(result, normal, "the normal of the largest plane, on which trunks stand")
+            level = _found(result, normal, "the normal of the largest plane, on which trunks stand")
+            return _tilted(sample, result, level, config) or level
     return Vertical((0.0, 0.0, 1.0), "z up is assumed: no direction shows a trunk")
+
+
+def _tilted(
+    sample: NDArray[np.float64], result: DetectionResult, upright: Vertical, config: DetectorConfig | None
+) -> Vertical | None:
+    """Return the common direction of the trunks where all lean one way: the scanner did not stand level, the trees do.
+
+    Three trunks that agree tell it; fewer, or the normal of the ground, only where that way shows much more of trees.
+    """
+    if _lean_rad(result) < _LEANS_RAD:
+        return None
+    starts = [_common_axis(result)]
+    normal = ground_normal(sample)
+    if normal is not None:
+        starts.append(_common_axis(detect_trees(sample, normal, None, config)) or normal)
+    best: Vertical | None = None
+    for up in starts:
+        looked = detect_trees(sample, up, None, config) if up is not None else None
+        if looked is None or not looked.trunks:
+            continue
+        needed = 0.95 if len(result.trunks) >= _AGREE and up == starts[0] else _BETTER
+        if _score(looked) >= needed * max(upright.score, best.score if best else 0.0):
+            best = _found(looked, up or upright.up, "the axes are tilted: trunks stand in this direction")
+    return best
+
+
+def _common_axis(result: DetectionResult) -> Up | None:
+    """Return the mean direction of the trunks; None when there are none."""
+    if not result.trunks:
+        return None
+    mean = np.mean([np.array(t.axis) * t.confidence for t in result.trunks], axis=0)
+    x, y, z = (float(v) for v in mean / max(float(np.linalg.norm(mean)), 1e-9))
+    return x, y, z
+
+
+def _lean_rad(result: DetectionResult) -> float:
+    """Return the angle between the direction that was taken for up and the trunks' common one."""
+    axis = _common_axis(result)
+    return 0.0 if axis is None else float(np.arccos(min(1.0, float(np.dot(axis, result.up)))))
 
 
 def _found(result: DetectionResult, up: Up, how: str) -> Vertical:
