@@ -39,7 +39,12 @@ def run(options: BenchOptions) -> BenchReport:
     if not file.exists():
         options.tell(f"{frames} frames at {RATE_HZ:g} Hz: {frames / RATE_HZ:.0f} s")
         file.write_text(json.dumps(asdict(run_live(walk, frames, RATE_HZ))), encoding="utf-8")
-    return _report(Live(**json.loads(file.read_text(encoding="utf-8"))), frames, seed)
+    live = Live(**json.loads(file.read_text(encoding="utf-8")))
+    if live.sent < frames - 1:
+        options.tell(
+            f"only {live.sent} of {frames} frames in {live.wall_s:.0f} s: the machine is busy; delete {file} to try again"
+        )
+    return _report(live, frames, seed)
 
 
 def _rendered(options: BenchOptions, seed: int, frames: int) -> Path:
@@ -65,13 +70,13 @@ def _percentiles(values: Sequence[float]) -> tuple[float, float, float]:
 
 def _report(live: Live, frames: int, seed: int) -> BenchReport:
     track, latency = _percentiles(live.track_ms), _percentiles(live.latency_ms)
-    parts = _parts(live, frames)
+    parts = _parts(live, live.sent)
     rows = [
         "| frames | tracking (ms), median | p95 | max | pose after (ms), median | p95 | cores | keyframes in the map | memory (MB) | not answered |",
         "|---|---|---|---|---|---|---|---|---|---|",
         *parts,
         "",
-        f"{live.sent} frames sent in {live.wall_s:.0f} s, {live.dropped} not answered, {live.lost} lost; {live.keyframes} keyframes made, {live.alive[-1]} of them in the map "
+        f"{live.sent} of {frames} frames sent in {live.wall_s:.0f} s, {live.dropped} not answered, {live.lost} lost; {live.keyframes} keyframes made, {live.alive[-1]} of them in the map "
         f"at the end; {live.loops} loops; {live.peak_mb:.0f} MB at most; position error {live.error_m[-1]:.2f} m at the end, "
         f"{max(live.error_m):.2f} m at most; {live.first_pose_s:.2f} s from the start of the process to the first pose.",
     ]
