@@ -112,7 +112,7 @@ def test_a_blackout_is_told_and_the_place_found_again() -> None:
 def test_a_camera_at_rest_gives_time_for_the_whole_map() -> None:
     slam, period_ns = Slam(INTRINSICS, SlamConfig(features=300)), 66_666_667
     views = [look(T) for T in turn_on_the_spot(12, 30.0)]
-    results = [slam.track(k * period_ns, *view) for k, view in enumerate([*views, *[views[-1]] * 45])]
+    results = [slam.track(k * period_ns, *view) for k, view in enumerate([*views, *[views[-1]] * 70])]
     made = [k for k, r in enumerate(results) if r.new_keyframes]
     whole = [k for k, r in enumerate(results) if r.graph is not None and r.graph.reason == "full_ba"]
     assert len(whole) == 1, "once, and not again while nothing new comes"
