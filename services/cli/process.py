@@ -14,9 +14,11 @@ import typer
 from services.cli.options import AsJson, ConfigFile, Settings, loaded
 
 if TYPE_CHECKING:
+    from rich.progress import TaskID
+
     from services.camera.sources import Source
     from services.evaluate.offline import Counts
-    from services.evaluate.sequence import Progress
+    from services.evaluate.sequence import FineProgress, Progress
 
 
 def process(
@@ -29,6 +31,9 @@ def process(
     camera: Annotated[
         Path | None, typer.Option("--camera", help="Intrinsics (default: the folder's camera.json)")
     ] = None,
+    fine: Annotated[
+        bool, typer.Option("--fine", help="Also make a finer map of all frames, and measure diameters along each stem")
+    ] = False,
     config: ConfigFile = None,
     settings: Settings = None,
     as_json: AsJson = False,
@@ -38,8 +43,17 @@ def process(
     from services.evaluate.sequence import process_sequence
 
     tree = loaded(config, settings, None).config
-    with _progress() as tell:
-        values = process_sequence(sequence, out, tree, camera=camera, skip_bad_frames=skip_bad_frames, progress=tell)
+    with _progress() as (tell, tell_fine):
+        values = process_sequence(
+            sequence,
+            out,
+            tree,
+            camera=camera,
+            skip_bad_frames=skip_bad_frames,
+            fine=fine,
+            progress=tell,
+            fine_progress=tell_fine,
+        )
     if values["source_note"]:
         typer.echo(f"treedock: {sequence}: {values['source_note']}", err=True)
     typer.echo(json.dumps(values) if as_json else _summary(values, out))
@@ -50,15 +64,15 @@ def process(
 
 
 @contextmanager
-def _progress() -> Iterator[Progress | None]:
-    """Show a bar on stderr when that is a terminal."""
+def _progress() -> Iterator[tuple[Progress | None, FineProgress | None]]:
+    """Show a bar on stderr when that is a terminal, and a second one for the finer map."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
 
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield None
+        yield None, None
         return
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Bar(*columns, console=console, transient=True) as bar:
@@ -69,13 +83,21 @@ def _progress() -> Iterator[Progress | None]:
             done = counts.frames + len(counts.skipped)
             bar.update(task, completed=done, total=source.expected, description=text)
 
-        yield tell
+        again: list[TaskID] = []
+
+        def tell_fine(done: int, whole: int) -> None:
+            if not again:
+                again.append(bar.add_task("finer map", total=whole))
+            bar.update(again[0], completed=done)
+
+        yield tell, tell_fine
 
 
 def _summary(values: dict[str, Any], out: Path) -> str:
     left_out = f", {values['bad_frames']} left out" if values["bad_frames"] else ""
     frame_ms = values["ms"]["frame"]["median"]
+    finer = f", {values['fine']['stems']} stems measured" if "fine" in values else ""
     return (
         f"{values['frames']} frames{left_out}, {values['tracked_final']} tracked, {values['trees']} trees "
-        f"({values['trees_suitable']} suitable), {frame_ms:.0f} ms a frame, {values['peak_memory_mb']:.0f} MB: {out}"
+        f"({values['trees_suitable']} suitable){finer}, {frame_ms:.0f} ms a frame, {values['peak_memory_mb']:.0f} MB: {out}"
     )

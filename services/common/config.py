@@ -11,6 +11,7 @@ from services.camera.config import CameraConfig
 from services.cli.run_config import SupervisorConfig
 from services.detector.config import DetectorServiceConfig
 from services.detector.refine.config import RefinerConfig
+from services.fine.config import FineConfig
 from services.mapper.config import MapperConfig
 from services.navigator.autopilot.config import AutopilotConfig
 from services.navigator.config import NavigatorConfig
@@ -43,6 +44,8 @@ class TreedockConfig(BaseModel):
     mapper: MapperConfig = MapperConfig()
     detector: DetectorServiceConfig = DetectorServiceConfig()
     refiner: RefinerConfig = RefinerConfig()
+    fine: FineConfig = FineConfig()
+    """Of ``treedock process --fine``, not of a service."""
     simulator: SimulatorConfig = SimulatorConfig()
     recorder: RecorderConfig = RecorderConfig()
     preview: PreviewConfig = PreviewConfig()

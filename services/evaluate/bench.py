@@ -17,6 +17,7 @@ BENCHES: dict[str, str] = {
     "catalogue": "services.evaluate.bench_catalogue",
     "detection": "services.evaluate.bench_detection",
     "mapper": "services.evaluate.bench_mapper",
+    "fine": "services.evaluate.bench_fine",
     "cameras": "services.evaluate.bench_cameras",
     "peers": "services.evaluate.bench_peers",
     "slam": "services.evaluate.bench_slam",

@@ -18,7 +18,7 @@ from services.evaluate.trees import Score, read_trees, read_truth, rmse, score
 _SIMULATOR = (
     "services.common.geometry",
     *(f"services.simulator.{name}" for name in (
-        "scene", "planting", "catalogue", "meshes", "world", "texture", "render", "sensor", "camera", "path", "truth",
+        "scene", "planting", "catalogue", "meshes", "world", "texture", "render", "sensor", "models", "camera", "path", "truth",
         "write",
     )),
 )  # fmt: skip
@@ -85,13 +85,13 @@ def run_scene(name: str, config: TreedockConfig, options: BenchOptions) -> dict[
 
 
 @contextmanager
-def _rendered(name: str, options: BenchOptions) -> Iterator[Path]:
+def _rendered(name: str, options: BenchOptions, rate_hz: float = RATE_HZ) -> Iterator[Path]:
     """Give the folder of a scene's sequence: one kept from an earlier call, or rendered now."""
     from services.simulator.catalogue import scene_by_name
     from services.simulator.write import write_sequence
 
     store = options.out / "sequences"
-    kept = store / f"{name}-{'half' if options.quick else 'full'}-{code_version(_SIMULATOR)}"
+    kept = store / f"{name}-{'half' if options.quick else 'full'}-{rate_hz:g}-{code_version(_SIMULATOR)}"
     if kept.is_dir():
         yield kept
         return
@@ -99,7 +99,7 @@ def _rendered(name: str, options: BenchOptions) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix=f"{name}-", dir=store) as folder:
         sequence = Path(folder) / name
         noise_seed = zlib.crc32(name.encode())  # each scene its own: one accelerometer bias for all would prove little
-        write_sequence(scene_by_name(name), sequence, rate_hz=RATE_HZ, reduced=options.quick, seed=noise_seed)
+        write_sequence(scene_by_name(name), sequence, rate_hz=rate_hz, reduced=options.quick, seed=noise_seed)
         if options.keep_sequences:
             sequence = sequence.rename(kept)
         yield sequence
@@ -158,6 +158,7 @@ def _read_results(path: Path) -> dict[str, dict[str, Any]]:
 
 
 def _append(path: Path, row: Mapping[str, Any]) -> None:
+    """Add a row to the file; a line that an interruption cut stays behind."""
     path.parent.mkdir(parents=True, exist_ok=True)
     torn = path.exists() and not path.read_bytes().endswith(b"\n") and path.stat().st_size > 0
     with path.open("a", encoding="utf-8") as stream:

@@ -6,7 +6,8 @@ import datetime as dt
 import io
 import math
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +72,14 @@ def cloud_laz(points_m: NDArray[np.float32], rgb: NDArray[np.uint8], stamp_ns: i
         rgb: (N, 3), or (0, 3) for none.
         stamp_ns: of the results; its day stands as the file's.
     """
+    return laz_bytes(points_m, rgb, stamp_ns)
+
+
+def laz_bytes(
+    points_m: NDArray[np.float32], rgb: NDArray[np.uint8], stamp_ns: int, classes: NDArray[np.uint8] | None = None,
+    more: Mapping[str, NDArray[Any]] | None = None,
+) -> bytes:  # fmt: skip
+    """Return the same with LAS classes (N,) and further values per point, by name."""
     import laspy
 
     header = laspy.LasHeader(version="1.4", point_format=7)
@@ -78,11 +87,17 @@ def cloud_laz(points_m: NDArray[np.float32], rgb: NDArray[np.uint8], stamp_ns: i
     header.offsets = np.zeros(3)
     header.creation_date = _utc(stamp_ns).date()
     header.generating_software = "treedock"
+    for name, values in (more or {}).items():
+        header.add_extra_dim(laspy.ExtraBytesParams(name=name, type=values.dtype))
     las = laspy.LasData(header)
     las.x, las.y, las.z = (points_m[:, k].astype(np.float64) for k in range(3))
     if len(rgb) == len(points_m) and len(rgb):
         # LAS colours have 16 bits; programs expect the upper ones filled
         las.red, las.green, las.blue = (rgb[:, k].astype(np.uint16) * 257 for k in range(3))
+    if classes is not None:
+        las.classification = classes
+    for name, values in (more or {}).items():
+        las[name] = values
     out = io.BytesIO()
     las.write(out, do_compress=True)
     return out.getvalue()

@@ -11,7 +11,7 @@ import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +30,14 @@ from services.common.geometry import from_transform
 from services.common.memory import Hub, MemoryContext
 from services.evaluate.exports import Stamped, Viewpoints
 
+if TYPE_CHECKING:
+    from services.slam.slam import Slam
+
 SETTLE_S = 3.0
 """Time that passes after the last frame: timers of the services fire, the last corrections reach the map."""
+
+_ADJUSTMENTS = 2
+"""Each throws out what the one before has shown to be wrong."""
 
 _NO_POINTS = np.empty((0, 3), np.float32)
 _NO_COLOURS = np.empty((0, 3), np.uint8)
@@ -74,6 +80,8 @@ class OfflineResult:
     """Of all, with the set-up."""
     seen: Viewpoints | None = None
     """From where each of ``points_m`` was seen."""
+    adjusted: list[Stamped] = field(default_factory=list)
+    """The trajectory after a last adjustment of all keyframes together, where that was asked for."""
 
 
 def default_builders() -> dict[str, Builder]:
@@ -127,15 +135,20 @@ class Chain:
         self._autopilot.publish(VEHICLE_STATE, state)
         self._hub.run()
 
-    def result(self) -> OfflineResult:
-        """Let the chain come to rest and collect the final estimates; a service left out contributes nothing."""
+    def result(self, adjust_keyframes: int = 0) -> OfflineResult:
+        """Let the chain come to rest and collect the final estimates; a service left out contributes nothing.
+
+        With ``adjust_keyframes`` a last bundle adjustment of up to so many keyframes gives ``adjusted``; nothing else changes.
+        """
         self._hub.advance_to(self._hub.clock.now_ns() + round(SETTLE_S * 1e9))
         slam, mapper, detector = (self._services.get(name) for name in ("slam", "mapper", "detector"))
         core = None if slam is None else slam.slam
         cloud = None if mapper is None else mapper.cloud()
+        trajectory = [] if core is None else list(core.final_trajectory())
         return OfflineResult(
             counts=self.counts,
-            trajectory=[] if core is None else list(core.final_trajectory()),
+            trajectory=trajectory,
+            adjusted=_adjusted(core, adjust_keyframes),
             online=self._online,
             points_m=_NO_POINTS if cloud is None else cloud.points_m,
             rgb=_NO_COLOURS if cloud is None else cloud.rgb,
@@ -170,6 +183,15 @@ class Chain:
         }
 
 
+def _adjusted(core: Slam | None, keyframes: int) -> list[Stamped]:
+    """Return the trajectory after adjusting all keyframes together until that no longer helps much."""
+    if core is None or not keyframes:
+        return []
+    for _ in range(_ADJUSTMENTS):
+        core.crew.submit(lambda: core.mapping.adjust_all(most=keyframes))
+    return list(core.final_trajectory())
+
+
 def _viewpoints(submaps: Iterable[Any]) -> Viewpoints | None:
     """Return the keyframes that the map's points were seen from; None where the map holds none, or too many to number."""
     held = list(submaps)
@@ -187,6 +209,7 @@ def run_offline(
     companions: Iterable[VehicleState] = (),
     keyframes_ns: Iterable[int] = (),
     skip_bad_frames: bool = False,
+    adjust_keyframes: int = 0,
     progress: Callable[[Counts], None] | None = None,
 ) -> OfflineResult:
     """Process all frames.
@@ -198,6 +221,7 @@ def run_offline(
         companions: what the autopilot said meanwhile, in order of time; each is heard before the first frame after it.
         keyframes_ns: stamps of the keyframes that a flight made of these frames; slam follows them.
         skip_bad_frames: go on past frames that cannot be used, and count them.
+        adjust_keyframes: adjust up to so many keyframes together once more at the end (``OfflineResult.adjusted``).
         progress: called after each frame with the counts so far.
 
     Raises:
@@ -222,7 +246,7 @@ def run_offline(
         chain.feed(frame)
         if progress is not None:
             progress(chain.counts)
-    return chain.result()
+    return chain.result(adjust_keyframes)
 
 
 def _good(frames: Iterable[RgbdFrame | BadFrame], skipped: list[str], *, skip_bad_frames: bool) -> Iterator[RgbdFrame]:

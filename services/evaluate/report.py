@@ -47,14 +47,18 @@ def report_bytes(
     trajectory: Sequence[Stamped],
     points_m: NDArray[np.float32],
     targets: Sequence[Target] = (),
+    more: Sequence[str] = (),
 ) -> bytes:
-    """Return the page for a run's metrics ``values``, its trees, final trajectory, map points (N, 3) and targets."""
+    """Return the page for a run's metrics ``values``, its trees, final trajectory, map points (N, 3) and targets.
+
+    ``more``: lines of HTML that stand before the target's section.
+    """
     bad = [f'<p class="warn">left out: {html.escape(reason)}</p>' for reason in values["bad_frame_reasons"][:20]]
     body = [
         "<!doctype html>", '<html lang="en"><head><meta charset="utf-8">', f"<title>{html.escape(title)}</title>",
         f"<style>{STYLE}</style></head><body>", f"<h1>{html.escape(title)}</h1>", _summary(values), *bad,
         "<h2>Trees</h2>", tree_table(trees), "<h2>From above</h2>", top_view_svg(trees, trajectory, points_m),
-        *trunks_section(trees, points_m), *filters_section(targets), "<h2>Time</h2>", _timings(values["ms"]),
+        *trunks_section(trees, points_m), *more, *filters_section(targets), "<h2>Time</h2>", _timings(values["ms"]),
         "<h2>Files beside this page</h2>", table(("file", "what it is"), _FILES, left=2), "</body></html>",
     ]  # fmt: skip
     return ("\n".join(body) + "\n").encode()

@@ -21,10 +21,11 @@ _INK, _FAINT, _FIT, _RAW = "#1d2a20", "#5c6b60", "#15803d", "#9aa69d"
 _GAP_S = 0.5
 
 
-def cross_section_svg(tree: Tree, points_m: NDArray[np.float32]) -> str:
+def cross_section_svg(tree: Tree, points_m: NDArray[np.float32], mark: str = "c") -> str:
     """Return the slice of the map (N, 3) about the height where the radius holds, seen from above, with the circle.
 
-    x (first heading) is up and y (left) is left, as on the map. Thinned to a few hundred points.
+    x (first heading) is up and y (left) is left, as on the map. Thinned to a few hundred points. ``mark`` tells two
+    pictures of one tree on a page apart.
     """
     half_m = max(tree.radius_m + _AROUND_M, 0.25)
     axis = np.array(tree.axis)
@@ -38,8 +39,8 @@ def cross_section_svg(tree: Tree, points_m: NDArray[np.float32]) -> str:
     bar_px = 0.1 * scale
     return "\n".join([
         f'<svg viewBox="0 0 {_SIDE_PX:.0f} {_SIDE_PX + 36:.0f}" width="{_SIDE_PX:.0f}" role="img" aria-label="{html.escape(words)}" font-size="12">',
-        f'<clipPath id="c{tree.id}"><rect width="{_SIDE_PX:.0f}" height="{_SIDE_PX:.0f}"/></clipPath>',
-        f'<g clip-path="url(#c{tree.id})"><g fill="{_FAINT}">{dots}</g>',
+        f'<clipPath id="{mark}{tree.id}"><rect width="{_SIDE_PX:.0f}" height="{_SIDE_PX:.0f}"/></clipPath>',
+        f'<g clip-path="url(#{mark}{tree.id})"><g fill="{_FAINT}">{dots}</g>',
         f'<circle cx="{middle:.1f}" cy="{middle:.1f}" r="{scale * tree.radius_m:.1f}" fill="none" stroke="{_FIT}" stroke-width="2"/>',
         f'<path d="M{middle - 5:.1f} {middle:.1f}h10M{middle:.1f} {middle - 5:.1f}v10" stroke="{_FIT}"/></g>',
         f'<path d="M8 {_SIDE_PX - 8:.0f}h{bar_px:.1f}" stroke="{_INK}" stroke-width="2"/>',

@@ -155,9 +155,12 @@ class Mapping:
             part = self._about(window, 2 * self.config.window_keyframes)
         self._adjust(part, 5, 5, "local_ba")
 
-    def adjust_all(self, about: int | None = None) -> None:
-        """Bundle adjustment of every keyframe but the first, and every point; in a large map of those about ``about``."""
-        most = self.config.full_keyframes
+    def adjust_all(self, about: int | None = None, most: int | None = None) -> None:
+        """Bundle adjustment of every keyframe but the first, and every point; in a large map of those about ``about``.
+
+        ``most``: keyframes above which a map is large, where it is not as configured.
+        """
+        most = self.config.full_keyframes if most is None else most
         with self.step():
             slots = self.atlas.slots
             if len(slots) > most:
