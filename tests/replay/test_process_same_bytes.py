@@ -24,12 +24,27 @@ RESULTS = (
     "trajectory_online.txt",
     "cloud.ply",
     "targets.jsonl",
+    "fine_cloud.laz",
+    "trees_fine.json",
+    "trees_fine.csv",
+    "sections_fine.csv",
+    "ground_fine.asc",
 )
 
 
 def process(sequence: Path, out: Path, hash_seed: str) -> None:
     environment = {**os.environ, "PYTHONHASHSEED": hash_seed, "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "services.cli.app", "process", str(sequence), "--out", str(out), "--json"]
+    command = [
+        sys.executable,
+        "-m",
+        "services.cli.app",
+        "process",
+        str(sequence),
+        "--out",
+        str(out),
+        "--json",
+        "--fine",
+    ]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=280)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["frames"] > 200
@@ -50,3 +65,9 @@ def test_two_runs_give_the_same_bytes_and_groundtruth_changes_none(tmp_path: Pat
     result = score(read_trees(tmp_path / "a" / "trees.json"), truth)
     assert len(read_trees(tmp_path / "a" / "trees.json")) >= 3
     assert len(result.matches) >= 2
+    finer = {tree["id"]: tree for tree in json.loads((tmp_path / "a" / "trees_fine.json").read_text())["trees"]}
+    for match in result.matches:
+        stem = finer[match.found.id]
+        assert stem["diameter_13_m"] == pytest.approx(2.0 * match.true.radius_m, abs=0.025)
+        assert len(stem["sections"]) >= 8
+    assert "Finer map" in (tmp_path / "a" / "report.html").read_text()
