@@ -7,7 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from services.common.kernels import solve_positive
-from services.detector.cylinder_kernels import to_upright
+from services.detector.axis_fit import to_upright
 from services.detector.ray import point_sigma, residual
 
 Floats = NDArray[np.float64]
@@ -66,13 +66,11 @@ def section_frame(
 
 @njit(cache=True, nogil=True)
 def fit_section(
-    P: Floats, U: Floats, G: Floats, group: NDArray[np.int64], left_out: int, k_range: float, surface: float,
-    centre_sigma: float, correlated: float, x: Floats,
+    P: Floats, U: Floats, G: Floats, k_range: float, surface: float, centre_sigma: float, correlated: float, x: Floats
 ) -> int:  # fmt: skip
     """Improve ``x`` = (cx, cy, radius) of one section by robust Gauss-Newton along the rays; return the points on it.
 
-    Points of ``group`` ``left_out`` do not count (-1: all count). The centre stays within ``centre_sigma`` of where it is,
-    in which so many ``correlated`` points count as one. 0: no fit.
+    The centre stays within ``centre_sigma`` of where it is, in which so many ``correlated`` points count as one. 0: no fit.
     """
     n = P.shape[0]
     cx0, cy0 = x[0], x[1]
@@ -84,8 +82,6 @@ def fit_section(
         y[:] = 0.0
         m, on = 0, 0
         for i in range(n):
-            if group[i] == left_out:
-                continue
             s = ((x[0] - P[i, 0]) * U[i, 1] - (x[1] - P[i, 1]) * U[i, 0]) / x[2]
             sigma = point_sigma(s, G[i], ray=True, k_range=k_range, surface=surface)
             e = residual(P[i, 0], P[i, 1], U[i, 0], U[i, 1], x[0], x[1], x[2], J) / sigma

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.trees import Tree
-from services.detector.cylinder_kernels import fit_axis
+from services.detector.cylinder_kernels import fit_axis, fit_cone, to_upright
 from services.fine.config import FineConfig
 from services.fine.model import BREAST_HEIGHT_M, Floats, Section, Stem, StemPoints
 from services.fine.stem_kernels import arc_of, fit_section, section_frame
@@ -24,6 +24,10 @@ _LEAST_POINTS = 200
 _MARGIN_M = 0.08
 """Around the surface: what lies further is not the stem's."""
 _CENTRE_SIGMA_M = 0.003
+_AXIS_POINTS = 60_000
+"""The joint fit takes so many, evenly: their neighbours say the same."""
+_JOINT_TURNS = 3
+_LEAST_ARC_RAD = 0.6
 _TUKEY = 4.0
 _GROUND_DOUBT_M = 0.02
 
@@ -35,12 +39,18 @@ class _Axis:
     at: Floats
     slope: Floats
     radius_m: float
+    """At ``at``."""
     taper: float
+    """Change of radius per metre along the axis."""
+
+    def at_height(self, z_m: float) -> Floats:
+        """Return the point of the line (3,) at a height of the map."""
+        return np.asarray(self.at + np.append(self.slope, 1.0) * (z_m - self.at[2]))
 
 
 @dataclass(frozen=True, slots=True)
 class _Sections:
-    """Radii (B,) at heights along the axis, and (blocks, B) with each part of the recording left out."""
+    """Radii (B,) at heights above the foot, and (blocks, B) with each part of the recording left out."""
 
     height_m: Floats
     radius_m: Floats
@@ -60,80 +70,146 @@ def measure_stem(tree: Tree, seen: StemPoints, origins_m: Floats, config: FineCo
     """
     if len(seen.points_m) < _LEAST_POINTS:
         return None
+    group = _blocks(seen.frame, config.blocks)
     axis = _axis(tree, seen, origins_m, config)
     if axis is None:
         return None
-    base = axis.at + np.append(axis.slope, 1.0) * (tree.z_m - axis.at[2])
-    sections = _sections(axis, base, seen, origins_m, config)
-    if len(sections.height_m) < 3:
+    whole = _sections(axis, tree.z_m, seen, origins_m, config)
+    if len(whole) < 3:
         return None
-    return _stem(tree, axis, base, sections, seen, config)
+    left_out = []
+    for k in range(config.blocks):
+        kept = group != k
+        part = StemPoints(seen.tree_id, seen.points_m[kept], seen.frame[kept])
+        other = _axis(tree, part, origins_m, config, axis) if np.count_nonzero(kept) >= _LEAST_POINTS else None
+        found = {} if other is None else _sections(other, tree.z_m, part, origins_m, config)
+        # a height that shows without this part only as with it tells nothing of the doubt
+        left_out.append([found[b].radius_m if b in found else whole[b].radius_m for b in whole])
+    sections = _Sections(
+        np.array([config.low_m + b * config.step_m for b in whole]), np.array([s.radius_m for s in whole.values()]),
+        np.array(left_out), np.array([s.arc_rad for s in whole.values()]), np.array([s.points for s in whole.values()]),
+    )  # fmt: skip
+    return _stem(tree, axis, axis.at_height(tree.z_m), sections, seen, config)
 
 
-def _axis(tree: Tree, seen: StemPoints, origins_m: Floats, config: FineConfig) -> _Axis | None:
-    """Return the joint fit of axis, radius and taper through all heights, begun at the live tree."""
+def _axis(
+    tree: Tree, seen: StemPoints, origins_m: Floats, config: FineConfig, begin: _Axis | None = None
+) -> _Axis | None:
+    """Return the joint fit of axis, radius and taper through all heights, begun at the live tree or at ``begin``.
+
+    Lean and taper look much alike from one side: only the curvature of many points tells them apart, so all of them count.
+    """
+    every = max(1, len(seen.points_m) // _AXIS_POINTS)
+    thinned = StemPoints(
+        seen.tree_id, np.ascontiguousarray(seen.points_m[::every]), np.ascontiguousarray(seen.frame[::every])
+    )
+    axis = _first_axis(tree, thinned, origins_m, config) if begin is None else begin
+    for _ in range(_JOINT_TURNS if axis is not None else 0):
+        assert axis is not None
+        axis = _improved(axis, tree, thinned, origins_m, config, every)
+        if axis is None:
+            break
+    return axis
+
+
+def _high_m(tree: Tree) -> float:
+    """Return the height of the map up to which the joint fit takes points."""
+    return tree.z_m + max(tree.height_seen_m, BREAST_HEIGHT_M + 0.3)
+
+
+def _first_axis(tree: Tree, seen: StemPoints, origins_m: Floats, config: FineConfig) -> _Axis | None:
+    """Return the live detector's fit to these points, begun at the live tree."""
     a = np.array(tree.axis)
     slope = a[:2] / max(a[2], 0.2)
     middle = np.array([tree.x_m, tree.y_m, tree.z_m]) + np.append(slope, 1.0) * BREAST_HEIGHT_M
-    high = tree.z_m + max(tree.height_seen_m, BREAST_HEIGHT_M + 0.3)
-    every = max(1, len(seen.points_m) // 60_000)
-    xyz = seen.points_m[::every].astype(np.float64)
-    ray = xyz - origins_m[seen.frame[::every]]
+    xyz = seen.points_m.astype(np.float64)
     x, normal = np.zeros(6), np.zeros((6, 6))
-    prior = np.array(
-        [[0.0, 1e-6], [0.0, 1e-6], [0.0, 150.0], [0.0, 150.0], [tree.radius_m, 1.0 / 0.03**2], [-0.006, 1.0 / 0.008**2]]
-    )
     scale, *_ = fit_axis(
-        xyz, ray, middle, slope, tree.radius_m, _MARGIN_M, tree.z_m + config.flare_m, high, 1.5, _CORRELATED,
-        config.range_noise_per_m, config.surface_noise_m, prior, normal, x,
+        xyz, xyz - origins_m[seen.frame], middle, slope, tree.radius_m, _MARGIN_M, tree.z_m + config.flare_m, _high_m(tree), 1.5,
+        _CORRELATED, config.range_noise_per_m, config.surface_noise_m, _prior(tree.radius_m), normal, x,
     )  # fmt: skip
     return None if scale < 0.0 else _Axis(middle, slope, float(x[4]), float(x[5]))
 
 
-def _sections(axis: _Axis, base: Floats, seen: StemPoints, origins_m: Floats, config: FineConfig) -> _Sections:
-    """Fit a circle to each height's points, whole and with each part of the recording left out."""
+def _prior(radius_m: float) -> Floats:
+    """Return mean and inverse variance of place (2), slopes (2), radius and taper in the axis frame."""
+    return np.array([
+        [0.0, 1e-6], [0.0, 1e-6], [0.0, 150.0], [0.0, 150.0], [radius_m, 1.0 / 0.03**2], [-0.006, 1.0 / 0.008**2],
+    ])  # fmt: skip
+
+
+def _improved(
+    axis: _Axis, tree: Tree, seen: StemPoints, origins_m: Floats, config: FineConfig, every: int
+) -> _Axis | None:
+    """Return the axis after one joint fit to all points near it; None where that fails or leaves the tree."""
     n = len(seen.points_m)
     P, U, G = np.empty((n, 3)), np.empty((n, 2)), np.empty(n)
+    section_frame(seen.points_m, seen.frame, origins_m, axis.at, axis.slope[0], axis.slope[1], P, U, G)
+    z = seen.points_m[:, 2]
+    near = _near_surface(P, G, axis.radius_m + axis.taper * P[:, 2], config)
+    near &= (z > tree.z_m + config.flare_m) & (z < _high_m(tree))
+    if np.count_nonzero(near) < _LEAST_POINTS:
+        return None
+    x, normal = np.array([0.0, 0.0, 0.0, 0.0, axis.radius_m, axis.taper]), np.zeros((6, 6))
+    scale = fit_cone(
+        P[near], U[near], G[near], every / _CORRELATED, x, config.range_noise_per_m, config.surface_noise_m, 1.5,
+        _prior(axis.radius_m), normal,
+    )  # fmt: skip
+    if scale < 0.0 or abs(x[4] - tree.radius_m) > 0.35 * tree.radius_m + 0.02 or float(np.hypot(x[0], x[1])) > 0.1:
+        return None
+    R = np.empty((3, 3))
+    to_upright(axis.slope[0], axis.slope[1], R)
+    direction = R.T @ np.array([x[2], x[3], 1.0])
+    return _Axis(axis.at + R.T @ np.array([x[0], x[1], 0.0]), direction[:2] / direction[2], float(x[4]), float(x[5]))
+
+
+def _near_surface(P: Floats, G: Floats, radius_m: Floats, config: FineConfig) -> NDArray[np.bool_]:
+    """Return which points may belong to the surface of a stem of radii (N,) around the z axis."""
+    away = np.abs(np.hypot(P[:, 0], P[:, 1]) - radius_m)
+    return np.asarray(away < _MARGIN_M + 0.5 * config.range_noise_per_m * G**2)
+
+
+@dataclass(frozen=True, slots=True)
+class _Circle:
+    """One height's circle."""
+
+    radius_m: float
+    arc_rad: float
+    points: int
+
+
+def _sections(
+    axis: _Axis, foot_m: float, seen: StemPoints, origins_m: Floats, config: FineConfig
+) -> dict[int, _Circle]:
+    """Fit a circle to each height's points; keys count steps of height from the lowest."""
+    n = len(seen.points_m)
+    P, U, G = np.empty((n, 3)), np.empty((n, 2)), np.empty(n)
+    base = axis.at_height(foot_m)
     section_frame(seen.points_m, seen.frame, origins_m, base, axis.slope[0], axis.slope[1], P, U, G)
     upright = 1.0 / float(np.sqrt(1.0 + axis.slope @ axis.slope))
-    height = P[:, 2] * upright
-    expected = axis.radius_m + axis.taper * (P[:, 2] - (axis.at[2] - base[2]) / upright)
-    near = np.abs(np.hypot(P[:, 0], P[:, 1]) - expected) < _MARGIN_M + 0.5 * config.range_noise_per_m * G**2
-    group = _blocks(seen.frame, config.blocks)
-    band = np.floor((height - config.low_m) / config.step_m + 0.5).astype(np.int64)
-    found = []
-    for b in range(int(band.max(initial=-1)) + 1):
+    above = (axis.at[2] - foot_m) / upright
+    near = _near_surface(P, G, axis.radius_m + axis.taper * (P[:, 2] - above), config)
+    band = np.floor((P[:, 2] * upright - config.low_m) / config.step_m + 0.5).astype(np.int64)
+    found = {}
+    for b in range(int(band[near].max(initial=-1)) + 1):
         chosen = np.flatnonzero(near & (band == b))
-        middle = config.low_m + b * config.step_m
-        start = max(axis.radius_m + axis.taper * (middle / upright - (axis.at[2] - base[2]) / upright), 0.01)
-        section = _section(P[chosen], U[chosen], G[chosen], group[chosen], start, config)
-        if section is not None:
-            found.append((middle, *section))
-    columns = list(zip(*found, strict=True)) if found else [(), (), (), (), ()]
-    return _Sections(
-        np.array(columns[0], dtype=float), np.array(columns[1], dtype=float),
-        np.array(columns[2], dtype=float).reshape(len(found), config.blocks).T, np.array(columns[3], dtype=float),
-        np.array(columns[4], dtype=np.int64),
-    )  # fmt: skip
+        length = (config.low_m + b * config.step_m) / upright
+        start = max(axis.radius_m + axis.taper * (length - above), 0.01)
+        circle = _circle(P[chosen], U[chosen], G[chosen], start, config)
+        if circle is not None:
+            found[b] = circle
+    return found
 
 
-def _section(
-    P: Floats, U: Floats, G: Floats, group: NDArray[np.int64], start_m: float, config: FineConfig
-) -> tuple[float, Floats, float, int] | None:
-    """Return radius, radii with each part left out, arc and points of one height; None where it does not show."""
+def _circle(P: Floats, U: Floats, G: Floats, start_m: float, config: FineConfig) -> _Circle | None:
+    """Return one height's circle; None where it does not show."""
     noise = (config.range_noise_per_m, config.surface_noise_m)
     x = np.array([0.0, 0.0, start_m])
-    on = fit_section(P, U, G, group, -1, *noise, _CENTRE_SIGMA_M, _CORRELATED, x)
+    on = fit_section(P, U, G, *noise, _CENTRE_SIGMA_M, _CORRELATED, x)
     if on < _LEAST_POINTS // 4 or abs(x[2] - start_m) > 0.3 * start_m + 0.01:
         return None
     arc = float(arc_of(P, U, G, x, *noise))
-    if arc < 0.6:
-        return None
-    radii = np.empty(config.blocks)
-    for k in range(config.blocks):
-        y = np.array([0.0, 0.0, x[2]])
-        radii[k] = y[2] if fit_section(P, U, G, group, k, *noise, _CENTRE_SIGMA_M, _CORRELATED, y) else x[2]
-    return float(x[2]), radii, arc, int(on)
+    return _Circle(float(x[2]), arc, int(on)) if arc >= _LEAST_ARC_RAD else None
 
 
 def _blocks(frame: NDArray[np.int32], blocks: int) -> NDArray[np.int64]:
@@ -156,20 +232,38 @@ def _stem(
     shown = float(np.median(sections.arc_rad[used]))
     unseen = config.out_of_round * radius * min(1.0, np.pi / shown) * max(0.0, 1.0 - shown / (2.0 * np.pi)) * 2.0
     sigma = float(np.hypot(np.hypot(spread, unseen), line[1] * _GROUND_DOUBT_M))
+    live = tree.radius_m + float(line[1]) * (at_m - tree.radius_height_m)
+    shift, sigma = agreed(radius, sigma, live, tree.sigma_radius_m)
+    radius += shift
     upward = np.append(axis.slope, 1.0) / np.sqrt(1.0 + axis.slope @ axis.slope)
     return Stem(
         tree_id=tree.id, base_m=(float(base[0]), float(base[1]), float(base[2])),
         axis=(float(upward[0]), float(upward[1]), float(upward[2])), diameter_13_m=2.0 * radius, sigma_13_m=2.0 * sigma,
         height_m=at_m, taper_m_per_m=2.0 * float(line[1]), sigma_taper=2.0 * jackknife_sigma(lines[:, 1]),
-        sections=_told(sections, used, config), points=len(seen.points_m), frames=len(np.unique(seen.frame)),
+        sections=_told(sections, used, shift, config), points=len(seen.points_m), frames=len(np.unique(seen.frame)),
         suitable=tree.suitable,
     )  # fmt: skip
 
 
-def _told(sections: _Sections, used: NDArray[np.bool_], config: FineConfig) -> tuple[Section, ...]:
+def agreed(fine_m: float, fine_sigma_m: float, live_m: float, live_sigma_m: float) -> tuple[float, float]:
+    """Return by how much the live radius moves the fine one, and the doubt of what comes out.
+
+    What is wrong with the sections of a one-sided stem is mostly common to all of them: the axis stands too far or too near
+    along the ray. The live radius knows something of that which clouds do not, the stem's silhouette (the refiner). The two
+    share frames, so how far their errors are alike is not known: covariance intersection (Julier and Uhlmann, 1997), with
+    the weights of independent errors, claims no more than either is sure of.
+    """
+    fine2, live2 = fine_sigma_m**2, max(live_sigma_m, 1e-4) ** 2
+    share = fine2 / (fine2 + live2)
+    combined2 = 1.0 / (share / live2 + (1.0 - share) / max(fine2, 1e-8))
+    return share * (live_m - fine_m), float(np.sqrt(combined2))
+
+
+def _told(sections: _Sections, used: NDArray[np.bool_], shift_m: float, config: FineConfig) -> tuple[Section, ...]:
+    """Return the sections, all moved by ``shift_m`` of radius."""
     out = []
     for b, height in enumerate(sections.height_m):
-        radius, arc = float(sections.radius_m[b]), float(sections.arc_rad[b])
+        radius, arc = max(float(sections.radius_m[b]) + shift_m, 0.005), float(sections.arc_rad[b])
         unseen = config.out_of_round * radius * max(0.0, 1.0 - arc / (2.0 * np.pi)) * 2.0
         sigma = float(np.hypot(jackknife_sigma(sections.left_out_m[:, b]), unseen))
         out.append(Section(float(height), 2.0 * radius, 2.0 * sigma, arc, int(sections.points[b]), bool(used[b])))

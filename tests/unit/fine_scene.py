@@ -32,7 +32,7 @@ class ConeStem:
         axis = np.array([*self.lean, 1.0]) / np.sqrt(1.0 + self.lean[0] ** 2 + self.lean[1] ** 2)
         return Tree(
             id=4, x_m=self.x + error, y_m=self.y - error, z_m=0.0, axis=(float(axis[0]), float(axis[1]), float(axis[2])),
-            radius_m=0.5 * self.d + 0.5 * error, radius_height_m=1.3, height_seen_m=2.6, sigma_xy_m=0.01, sigma_radius_m=0.005,
+            radius_m=0.5 * self.d + 0.5 * error, radius_height_m=1.3, height_seen_m=2.6, sigma_xy_m=0.01, sigma_radius_m=0.03,
             arc_rad=1.6, confidence=0.9, observations=9, suitable=True,
         )  # fmt: skip
 

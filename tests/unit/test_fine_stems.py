@@ -7,7 +7,7 @@ import pytest
 
 from services.fine.config import FineConfig
 from services.fine.model import Stem, StemPoints
-from services.fine.stems import fit_taper, jackknife_sigma, measure_stem
+from services.fine.stems import agreed, fit_taper, jackknife_sigma, measure_stem
 from tests.unit.fine_scene import ConeStem, seen_from
 
 CONFIG = FineConfig()
@@ -104,6 +104,15 @@ def test_taper_of_exact_sections_is_exact_and_one_wild_one_is_left_out() -> None
     line, used = fit_taper(height, radius, weight)
     assert line == pytest.approx([0.12, -0.006], abs=1e-5)
     assert list(np.flatnonzero(~used)) == [7]
+
+
+def test_the_live_radius_counts_as_much_as_it_is_sure() -> None:
+    shift, sigma = agreed(0.100, 0.004, 0.108, 0.004)
+    assert shift == pytest.approx(0.004)
+    assert sigma == pytest.approx(0.004)  # no surer than either: they share frames
+    shift, sigma = agreed(0.100, 0.002, 0.108, 0.020)
+    assert abs(shift) < 0.0002
+    assert 0.002 <= sigma < 0.0021
 
 
 def test_jackknife_of_a_mean_is_its_standard_error() -> None:
