@@ -17,6 +17,7 @@ from services.detector.cylinder_kernels import fit_axis, fit_cone, to_upright
 from services.fine.config import FineConfig
 from services.fine.model import BREAST_HEIGHT_M, Floats, Section, Stem, StemPoints
 from services.fine.stem_kernels import arc_of, fit_section, section_frame
+from services.fine.taper import agreed, fit_taper, jackknife_sigma
 
 _CORRELATED = 12.0
 """Neighbouring pixels share noise: so many count as one against the priors."""
@@ -28,7 +29,6 @@ _AXIS_POINTS = 60_000
 """The joint fit takes so many, evenly: their neighbours say the same."""
 _JOINT_TURNS = 3
 _LEAST_ARC_RAD = 0.6
-_TUKEY = 4.0
 _GROUND_DOUBT_M = 0.02
 
 
@@ -245,20 +245,6 @@ def _stem(
     )  # fmt: skip
 
 
-def agreed(fine_m: float, fine_sigma_m: float, live_m: float, live_sigma_m: float) -> tuple[float, float]:
-    """Return by how much the live radius moves the fine one, and the doubt of what comes out.
-
-    What is wrong with the sections of a one-sided stem is mostly common to all of them: the axis stands too far or too near
-    along the ray. The live radius knows something of that which clouds do not, the stem's silhouette (the refiner). The two
-    share frames, so how far their errors are alike is not known: covariance intersection (Julier and Uhlmann, 1997), with
-    the weights of independent errors, claims no more than either is sure of.
-    """
-    fine2, live2 = fine_sigma_m**2, max(live_sigma_m, 1e-4) ** 2
-    share = fine2 / (fine2 + live2)
-    combined2 = 1.0 / (share / live2 + (1.0 - share) / max(fine2, 1e-8))
-    return share * (live_m - fine_m), float(np.sqrt(combined2))
-
-
 def _told(sections: _Sections, used: NDArray[np.bool_], shift_m: float, config: FineConfig) -> tuple[Section, ...]:
     """Return the sections, all moved by ``shift_m`` of radius."""
     out = []
@@ -276,32 +262,3 @@ def _weights(sections: _Sections, config: FineConfig) -> Floats:
     weight = 1.0 / (spread**2 + (0.01 * sections.radius_m + 0.0005) ** 2)
     above = sections.height_m >= config.flare_m
     return np.asarray(np.where(above, weight, 0.0) if np.count_nonzero(above) >= 3 else weight)
-
-
-def jackknife_sigma(values: Floats) -> float:
-    """Return the standard deviation of an estimate from its values with each of n groups left out."""
-    n = len(values)
-    return float(np.sqrt((n - 1) / n * np.sum((values - values.mean()) ** 2)))
-
-
-def fit_taper(height_m: Floats, radius_m: Floats, weight: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return (radius at 1.3 m, its change per metre) of a line through sections, and which of them it took for good.
-
-    Iteratively reweighted (Tukey's biweight): a branch whorl or a hidden height does not pull it. The change has a weak
-    prior about -6 mm a metre, so that a short piece of stem does not extrapolate wildly.
-    """
-    x = height_m - BREAST_HEIGHT_M
-    held = weight > 0.0
-    robust = weight.copy()
-    line = np.array([float(np.median(radius_m[held])), -0.006])
-    for _ in range(15):
-        A = np.array([[robust.sum(), (robust * x).sum()], [(robust * x).sum(), (robust * x * x).sum() + 1.0 / 0.02**2]])
-        y = np.array([(robust * radius_m).sum(), (robust * x * radius_m).sum() - 0.006 / 0.02**2])
-        line = np.linalg.solve(A, y)
-        off = (radius_m - line[0] - line[1] * x) * np.sqrt(weight)
-        spread = max(1.0, 1.4826 * float(np.median(np.abs(off[held]))))
-        t = off / (_TUKEY * spread)
-        robust = np.where(np.abs(t) < 1.0, weight * (1.0 - t * t) ** 2, 0.0)
-        if not np.count_nonzero(robust):
-            robust = weight.copy()
-    return line, robust > 0.0

@@ -7,7 +7,8 @@ import pytest
 
 from services.fine.config import FineConfig
 from services.fine.model import Stem, StemPoints
-from services.fine.stems import agreed, fit_taper, jackknife_sigma, measure_stem
+from services.fine.stems import measure_stem
+from services.fine.taper import agreed, fit_taper, jackknife_sigma
 from tests.unit.fine_scene import ConeStem, seen_from
 
 CONFIG = FineConfig()
