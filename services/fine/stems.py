@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.trees import Tree
-from services.detector.cylinder_kernels import fit_axis, fit_cone, to_upright
+from services.detector.axis_fit import _fit as fit_views
+from services.detector.axis_fit import fit_axis, to_upright
 from services.fine.config import FineConfig
 from services.fine.model import BREAST_HEIGHT_M, Floats, Section, Stem, StemPoints
 from services.fine.stem_kernels import arc_of, fit_section, section_frame
@@ -27,7 +28,11 @@ _MARGIN_M = 0.08
 _CENTRE_SIGMA_M = 0.003
 _AXIS_POINTS = 60_000
 """The joint fit takes so many, evenly: their neighbours say the same."""
-_JOINT_TURNS = 3
+_JOINT_TURNS, _FIT_TURNS = 3, 12
+_VIEWS = 32
+"""Parts of the recording that may lie a little beside each other in the joint fit."""
+_HELD = 1.0 / 0.004**2
+"""By so much (inverse variance): a frame's pose error, and the sensor's pattern that goes with the camera."""
 _LEAST_ARC_RAD = 0.6
 _GROUND_DOUBT_M = 0.02
 
@@ -122,11 +127,10 @@ def _first_axis(tree: Tree, seen: StemPoints, origins_m: Floats, config: FineCon
     a = np.array(tree.axis)
     slope = a[:2] / max(a[2], 0.2)
     middle = np.array([tree.x_m, tree.y_m, tree.z_m]) + np.append(slope, 1.0) * BREAST_HEIGHT_M
-    xyz = seen.points_m.astype(np.float64)
     x, normal = np.zeros(6), np.zeros((6, 6))
     scale, *_ = fit_axis(
-        xyz, xyz - origins_m[seen.frame], middle, slope, tree.radius_m, _MARGIN_M, tree.z_m + config.flare_m, _high_m(tree), 1.5,
-        _CORRELATED, config.range_noise_per_m, config.surface_noise_m, _prior(tree.radius_m), normal, x,
+        seen.points_m, seen.frame, origins_m, np.zeros(3), middle, slope, tree.radius_m, _MARGIN_M, tree.z_m + config.flare_m,
+        _high_m(tree), 1.5, _CORRELATED, _HELD, config.range_noise_per_m, config.surface_noise_m, _prior(tree.radius_m), normal, x,
     )  # fmt: skip
     return None if scale < 0.0 else _Axis(middle, slope, float(x[4]), float(x[5]))
 
@@ -151,9 +155,10 @@ def _improved(
     if np.count_nonzero(near) < _LEAST_POINTS:
         return None
     x, normal = np.array([0.0, 0.0, 0.0, 0.0, axis.radius_m, axis.taper]), np.zeros((6, 6))
-    scale = fit_cone(
-        P[near], U[near], G[near], every / _CORRELATED, x, config.range_noise_per_m, config.surface_noise_m, 1.5,
-        _prior(axis.radius_m), normal,
+    views = _blocks(seen.frame[near], _VIEWS).astype(np.int32)
+    scale = fit_views(
+        P[near], U[near], G[near], views, np.zeros((_VIEWS, 2)), int(views.max()) + 1, _HELD, every / _CORRELATED, x,
+        config.range_noise_per_m, config.surface_noise_m, 1.5, _prior(axis.radius_m), normal, _FIT_TURNS,
     )  # fmt: skip
     if scale < 0.0 or abs(x[4] - tree.radius_m) > 0.35 * tree.radius_m + 0.02 or float(np.hypot(x[0], x[1])) > 0.1:
         return None
