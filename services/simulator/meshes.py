@@ -93,6 +93,13 @@ def _bumpy_radii(tree: SceneTree, heights: Floats) -> Floats:
     return np.asarray(polygon * tree.mean_radius(heights)[:, None] * (1.0 + scale * bumps))
 
 
+def trunk_radii(tree: SceneTree, heights_m: Floats) -> tuple[Floats, Floats]:
+    """Return angles (S,) round the axis and the surface's mean distance from it (H, S): what the mesh shows at heights."""
+    angle = np.arange(TRUNK_SIDES) * (2.0 * math.pi / TRUNK_SIDES)
+    polygon = 2.0 / (1.0 + math.cos(math.pi / TRUNK_SIDES))
+    return angle, _bumpy_radii(tree, heights_m) / polygon
+
+
 def _fork_stems(tree: SceneTree, fork_m: float) -> list[Mesh]:
     rng = np.random.default_rng([tree.seed, 2])
     # within 50 degrees of broadside to the start, or nobody could tell from there that it forks

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -28,7 +29,16 @@ def test_a_trees_errors_are_in_diameters_at_the_same_height() -> None:
     assert row["live_error_m"] == pytest.approx(0.010)
     assert row["fine_error_m"] == pytest.approx(0.003, abs=1e-5)
     assert row["taper_error"] == pytest.approx(0.001, abs=1e-5)
+    assert 0.0 < abs(row["limit_m"]) < 0.1 * row["true_m"]
     assert row["section_errors_m"] == [pytest.approx(-0.002, abs=1e-5)]
+
+
+def test_a_smooth_trunk_could_be_told_from_one_side() -> None:
+    true = scene_by_name(SCENE).trees[0]
+    assert bench_fine.side_error_m(dataclasses.replace(true, bumps=0.0), 0.3) == pytest.approx(0.0, abs=1e-6)
+    trees = [dataclasses.replace(true, seed=seed, radius_m=0.1) for seed in range(40)]
+    shares = [bench_fine.side_error_m(tree, 0.1 * tree.seed) / 0.1 for tree in trees]
+    assert 0.008 < (sum(s * s for s in shares) / 40) ** 0.5 < 0.025
 
 
 def test_the_report_counts_what_was_measured_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -37,7 +47,7 @@ def test_the_report_counts_what_was_measured_and_resumes(tmp_path: Path, monkeyp
     def one(name: str, *_: object) -> dict[str, object]:
         done.append(name)
         tree = {
-            "true_m": 0.2, "live_error_m": 0.006, "live_sigma_m": 0.004, "fine_error_m": -0.003, "fine_sigma_m": 0.004, "frames": 9,
+            "true_m": 0.2, "live_error_m": 0.006, "live_sigma_m": 0.004, "fine_error_m": -0.003, "fine_sigma_m": 0.004, "frames": 9, "limit_m": 0.002,
             "taper_error": 0.001, "taper_sigma": 0.002, "section_errors_m": [0.001, -0.003], "section_sigmas_m": [0.002, 0.002],
         }  # fmt: skip
         hidden = {"true_m": 0.1, "live_error_m": 0.001, "live_sigma_m": 0.004}
