@@ -95,9 +95,9 @@ def _bumpy_radii(tree: SceneTree, heights: Floats) -> Floats:
 
 def trunk_radii(tree: SceneTree, heights_m: Floats) -> tuple[Floats, Floats]:
     """Return angles (S,) round the axis and the surface's mean distance from it (H, S): what the mesh shows at heights."""
-    angle = np.arange(TRUNK_SIDES) * (2.0 * math.pi / TRUNK_SIDES)
+    angle = np.asarray(np.arange(TRUNK_SIDES) * (2.0 * math.pi / TRUNK_SIDES), dtype=np.float64)
     polygon = 2.0 / (1.0 + math.cos(math.pi / TRUNK_SIDES))
-    return angle, _bumpy_radii(tree, heights_m) / polygon
+    return angle, np.asarray(_bumpy_radii(tree, heights_m) / polygon, dtype=np.float64)
 
 
 def _fork_stems(tree: SceneTree, fork_m: float) -> list[Mesh]:
