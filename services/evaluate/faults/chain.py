@@ -22,6 +22,7 @@ from schemas.slam import Pose
 from schemas.topics import SIM_RGBD, SLAM_POSE
 from schemas.trees import TreeList
 from services.common.errors import InputError
+from services.common.session import free_port
 from services.evaluate.bench import BenchOptions
 from services.evaluate.faults.rig import Comeback, Rig
 from services.evaluate.live_set import frames_for, live_config
@@ -46,7 +47,12 @@ class Chain:
         """Render a scene of ``seed``, the named one without (or take up what was rendered), and make the chain over it."""
         options = BenchOptions(seed=seed, out=folder.parent / "treedock-faults-recordings", tell=tell)
         _, frames = frames_for(options)
-        return cls(Rig(live_config(folder / "chain"), folder / "chain", SERVICES, standins=frozenset()), frames)
+        config = live_config(folder / "chain")
+        # never the usual port: others' services would join
+        config = config.model_copy(
+            update={"router": config.router.model_copy(update={"port": free_port(config.router.host)})}
+        )
+        return cls(Rig(config, folder / "chain", SERVICES, standins=frozenset()), frames)
 
     def __enter__(self) -> Self:
         self._there_and_back: Iterator[RgbdFrame] = itertools.cycle([*self.frames, *reversed(self.frames)])
