@@ -21,6 +21,13 @@ from services.common.errors import InputError
 HUB = "10.77.0.1"
 _PREFIX = "10.77.0."
 _TOOLS = ("ip", "unshare", "nsenter")
+_PROBE = """
+ip link add hub type bridge
+ip link add one type veth peer name other
+mount -t tmpfs tmpfs /dev/shm
+unshare --net --mount --ipc -- true
+"""
+"""All that is needed of the kernel, tried once."""
 
 
 def why_not() -> str:
@@ -28,8 +35,8 @@ def why_not() -> str:
     missing = [tool for tool in _TOOLS if shutil.which(tool) is None]
     if missing:
         return f"{', '.join(missing)} not installed (Debian: iproute2, util-linux)"
-    tried = subprocess.run([*enter_fresh(), "true"], capture_output=True, text=True, check=False)
-    return f"no network namespaces: {tried.stderr.strip()[:200]}" if tried.returncode else ""
+    tried = subprocess.run([*enter_fresh(), "sh", "-ec", _PROBE], capture_output=True, text=True, check=False)
+    return f"no network namespaces here: {tried.stderr.strip()[:200]}" if tried.returncode else ""
 
 
 def enter_fresh() -> list[str]:
