@@ -28,6 +28,8 @@ from services.evaluate.faults.system import flight_config
 
 _STALL_S = 0.7
 """Longer than the 0.4 s after which a silent slam is held for, shorter than the 1.2 s after which is landed."""
+_STALL_MOST_S = 0.9
+"""On a busy machine the end of a stall comes late; a longer one lands, rightly."""
 _NOISE_HZ = 200.0
 _FLIGHT_WITHIN_S = 300.0
 _TMPFS_MB = 3
@@ -53,21 +55,25 @@ def rows() -> list[Row]:
 
 
 def _camera_stall(bench: Bench) -> Result:
-    again = list[str]()
+    again, stalls = list[str](), list[float]()
 
     def stall(flights: Flights) -> Back:
         rig = flights.rig
-        restarts = rig.supervisor.restarts
+        restarts, at_ns = rig.supervisor.restarts, rig.flown.now_ns
         pid, _ = rig.harm("camera", signal.SIGSTOP)
         rig.fly_s(_STALL_S, 20.0)
         os.kill(pid, signal.SIGCONT)
+        stalls.append((rig.flown.now_ns - at_ns) * 1e-9)
         rig.fly_s(1.0, 20.0)
         again.extend([f"{rig.supervisor.restarts - restarts} restarts"] * (rig.supervisor.restarts > restarts))
         return Back()
 
     result = passing(bench, "camera stall", stall, lands=False)
+    measured = {**result.measured, "stall_s": max(stalls)}
+    if max(stalls) > _STALL_MOST_S:
+        return Result((), measured, result.told, f"the machine is too busy: one stall became {max(stalls):.1f} s long")
     late = [] if (result.measured["held_s"] or 0.0) <= 0.65 else [f"held after {result.measured['held_s']} s"]
-    return Result((*result.failed, *late, *again), result.measured, result.told)
+    return Result((*result.failed, *late, *again), measured, result.told)
 
 
 def _whole_mission(flights: Flights) -> list[str]:
