@@ -64,7 +64,7 @@ class Chain:
         self.rig.each = self._feed
         self._due_s = time.monotonic()
         self.rig.pump(2.0 * len(self.frames) / _RATE_HZ + 5.0)  # once there and back: all trees are known
-        if not self.trees:
+        if not self.rig.until(lambda: self.trees is not None, _SEEN_WITHIN_S):
             raise InputError("the recording shows no tree: another --seed")
         return self
 
