@@ -100,7 +100,8 @@ def report_of(rows: Sequence[Mapping[str, Any]], seed: int, moments: int, versio
     for row in rows:
         m = row["measured"]
         cells = " | ".join(
-            "" if m.get(k) is None else f"{m[k]:.2f}" for k in ("held_s", "rest_s", "way_m", "noticed_s", "back_s")
+            "" if m.get(k) is None else f"{m[k]:.2f}"
+            for k in ("held_s", "rest_s", "way_m", "noticed_s", "back_s", "ready_s")
         )
         lines.append(
             f"| {row['row']} | {row['group']} | {verdict_of(row)} | {cells} | {row['seconds']:.0f} | {row['load']} |"
