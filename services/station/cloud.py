@@ -27,6 +27,11 @@ class CloudView:
         self._held: set[int] = set()
         self.map_id = ""
 
+    @property
+    def empty(self) -> bool:
+        """Whether nothing has come yet."""
+        return not self._held
+
     def take(self, sketch: SubmapSketch) -> list[tuple[str, bytes]]:
         """Return frames with their keys, of which a later one replaces an earlier that still waits.
 

@@ -59,7 +59,7 @@ _REQUEST_RING = 512
 _TOKEN_RING = 1_024
 _ORDERS_AT_ONCE = 8
 _NOT_ABOARD = frozenset({"router", "recorder"})
-_CLOUD_ASKS, _CLOUD_TIMEOUT_S = 12, 5.0
+_CLOUD_ASKS, _CLOUD_TIMEOUT_S, _CLOUD_AGAIN_S = 12, 5.0, 5.0
 _TOPICS: dict[Topic, Callable[[Aircraft, Any], object]] = {
     SLAM_POSE: Aircraft.on_pose, MISSION_STATE: Aircraft.on_mission, VEHICLE_STATE: Aircraft.on_vehicle,
     TREES_TARGET: Aircraft.on_target, HEALTH: Aircraft.on_health,
@@ -84,6 +84,7 @@ class Station:
         self.brain = Brain(self.config, self.site, self._send_order, time.time_ns)
         self.brain.on_cloud_wish = self._on_cloud_wish
         self._clouds: dict[str, CloudView] = {}
+        self._clouds_asked_s: dict[str, float] = {}
         self.keeping = Keeping(self.config.inventory, self.brain.log, context.health, self.call)
         self.site.downloads = self.keeping.downloads()
         self._told = context.inbox.mailbox(lambda call: call(), _REQUEST_RING)
@@ -209,6 +210,7 @@ class Station:
     def _on_cloud_wish(self, uav: str) -> None:
         """Ask for the whole map; follow its changes from then on."""
         bus = self._buses[uav]
+        self._clouds_asked_s[uav] = time.monotonic()
         if uav not in self._clouds:
             self._clouds[uav] = CloudView(uav)
             bus.subscribe(MAP_SKETCH, functools.partial(self._on_sketch, uav))
@@ -241,6 +243,13 @@ class Station:
             self._buses[uav].unsubscribe(MAP_SKETCH)
             del self._clouds[uav]
 
+    def _ask_again_for_clouds(self) -> None:
+        """A page may look before there is a mapper, or a map: ask now and then until something comes."""
+        now_s = time.monotonic()
+        for uav, view in self._clouds.items():
+            if view.empty and now_s - self._clouds_asked_s.get(uav, 0.0) > _CLOUD_AGAIN_S:
+                self._on_cloud_wish(uav)
+
     # -- orders
 
     def _send_order(self, order: Outgoing) -> None:
@@ -261,6 +270,7 @@ class Station:
     def _each_second(self) -> None:
         self.brain.tell_trees()
         self._end_unwatched_clouds()
+        self._ask_again_for_clouds()
         passed: Counter[str] = Counter()
         for bus in self._buses.values():
             bus.count_overflows()

@@ -108,7 +108,8 @@ class StubAircraft:
         c.answer(COMMAND_NONCE, NonceRequest, self._on_nonce)
         for name in get_args(CommandName):
             c.answer(COMMAND, Command, self._on_command, leaf=name)
-        c.answer_state(MAP_SKETCH, lambda: list(cloud_of(self.world.trees, 1)))
+        sketches = cloud_of(self.world.trees, 1)
+        c.answer_state(MAP_SKETCH, lambda: list(sketches))
         c.every_wall(_TICK_S, self.tick)
         c.every_wall(1.0, self._tell_health)
 

@@ -198,3 +198,6 @@ def test_a_second_hello_tells_everything_again(ground: Ground, page: Page) -> No
     true(page, f"(window.treedock?.craft?.trees.length ?? 0) >= {before}", 5.0)
     assert page.evaluate("performance.now()") < 3_000.0  # since the page began to load
     assert until(lambda: page.evaluate("window.treedock.craft.trail.length") > 5, 3.0)
+    # trunks stand in the height of flight, the ground does not: cells of 25 cm
+    true(page, "window.treedock.obstacles.found > 20", 20.0)
+    assert page.evaluate("window.treedock.obstacles.found") < 400

@@ -1,12 +1,14 @@
 // The page: joins link, model, map, panels and orders. Redraws the map when something moved, the words four times a second.
 
 import { drawAlarm, drawMission, drawPreview } from "./cards.js";
+import { Cloud } from "./cloud.js";
 import { $, el, set, text } from "./dom.js";
 import { drawFleet, drawTiles } from "./fleet.js";
 import { onHold } from "./hold.js";
 import { Link } from "./link.js";
 import { MapView } from "./map.js";
 import { Craft } from "./model.js";
+import { Obstacles } from "./obstacles.js";
 import { CHOOSE, OrderBar } from "./orders.js";
 import { palette } from "./paint.js";
 import { drawLog, drawSystems, drawTrees, drawVitals } from "./panels.js";
@@ -33,6 +35,8 @@ class Page {
       welcome: (m) => this.onWelcome(m),
       binary: (data) => this.onBinary(data),
     });
+    this.cloud = new Cloud(this);
+    this.obstacles = this.map.obstacles = new Obstacles(this.cloud, () => (this.map.dirty = true));
     this.phone = matchMedia("(max-width: 760px)");
     this.buttons();
     this.theme(localStorage.getItem("treedock.theme") || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
@@ -62,9 +66,9 @@ class Page {
 
   onWelcome(message) {
     this.me = message.you;
-    this.cloud = message.cloud;
+    this.cloudAllowed = message.cloud;
     this.inventory = message.inventory;
-    this.view3d?.reconnected();
+    this.cloud.reconnected();
     text($("operator-name"), this.me.name);
     this.events = [];
     this.crafts.forEach((craft) => (craft.treesVersion = -1));
@@ -95,7 +99,7 @@ class Page {
   onBinary(data) {
     const bytes = new Uint8Array(data), name = new TextDecoder().decode(bytes.subarray(2, 2 + bytes[1]));
     if (bytes[0] !== 80) {
-      this.view3d?.take(name, data, 2 + bytes[1]);
+      this.cloud.take(name, data, 2 + bytes[1]);
       return;
     }
     const craft = this.crafts.get(name);
@@ -273,6 +277,7 @@ class Page {
   drawWords() {
     const now = performance.now(), craft = this.craft;
     this.map.inset = this.phone.matches ? { top: 0, bottom: 0, right: 60 } : { top: Math.min($("mission").offsetHeight + 8, innerHeight * 0.25), bottom: 44, right: 0 };
+    this.cloud.look(this.grid || document.hidden ? null : craft?.uav ?? null);
     drawFleet(this, now);
     if (this.grid) drawTiles(this, now);
     drawMission(craft, now, this.grid);

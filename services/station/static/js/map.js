@@ -112,7 +112,8 @@ export class MapView {
     c.fillStyle = this.colours.map;
     c.fillRect(0, 0, this.width, this.height);
     const craft = this.craft;
-    if (craft) this.drawSeen(c, craft);
+    if (craft) this.drawCells(c, craft.seen, craft.seen.image(this.colours.seen));
+    if (craft && this.obstacles) this.drawCells(c, this.obstacles, this.obstacles.image(this.colours.solid, now));
     this.drawGrid(c);
     if (!craft) return;
     this.drawTrail(c, craft);
@@ -124,13 +125,14 @@ export class MapView {
     if (!this.bare) this.drawScale(c);
   }
 
-  drawSeen(c, craft) {
-    const { seen } = craft, side = seen.size * seen.cell * this.scale, [u, v] = this.px(0, 0);
+  /** Draw a raster of cells about the origin. */
+  drawCells(c, { size, cell }, image) {
+    const side = size * cell * this.scale, [u, v] = this.px(0, 0);
     c.save();
     c.translate(u, v);
     c.rotate(-Math.PI / 2); // the image has x to the right
     c.imageSmoothingEnabled = true;
-    c.drawImage(seen.image(this.colours.seen), -side / 2, -side / 2, side, side);
+    c.drawImage(image, -side / 2, -side / 2, side, side);
     c.restore();
   }
 

@@ -5,7 +5,7 @@ export function palette() {
   const style = getComputedStyle(document.documentElement);
   const of = (name) => style.getPropertyValue(`--${name}`).trim();
   return {
-    map: of("map"), grid: of("map-grid"), grid5: of("map-grid-5"), ink: of("map-ink"), seen: of("seen"), cone: of("cone"), coneLine: of("cone-line"), craft: of("craft"),
+    map: of("map"), grid: of("map-grid"), grid5: of("map-grid-5"), ink: of("map-ink"), seen: of("seen"), solid: of("solid"), cone: of("cone"), coneLine: of("cone-line"), craft: of("craft"),
     trail: of("trail"), tree: of("tree"), treeInk: of("tree-ink"), un: of("tree-un"), visited: of("tree-visited"), target: of("tree-target"), soft: of("soft"), surface: of("surface"),
   };
 }

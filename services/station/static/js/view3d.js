@@ -10,8 +10,6 @@ import { palette } from "./paint.js";
 
 const TRUNK_M = 3, TRUNKS_MAX = 2000, TRAIL_MAX = 4000;
 const SLOW_MS = 60, FAST_MS = 38, REST_MS = 300, POINTS_MIN = 10000;
-const POINTS = 0, REMOVED = 1; // kinds of a cloud's frame; the third, a new place alone, is what is left
-const HEAD_BYTES = 12 + 48; // number, kind, count; the top three rows of the submap's place
 
 /** Whether this browser draws by the processor alone: then smoothed edges would cost more than all points. */
 function drawsInSoftware() {
@@ -76,6 +74,7 @@ export class View3d {
     this.cloudMaterial = new PointsMaterial({ size: 2, sizeAttenuation: false, vertexColors: true });
     this.submaps = new Map();
     this.points = 0;
+    this.page.cloud.listen((number, submap) => this.put(number, submap));
   }
 
   theme(colours) {
@@ -93,7 +92,6 @@ export class View3d {
 
   set(on) {
     this.on = on;
-    this.askCloud();
     if (on) {
       this.fit();
       requestAnimationFrame(() => this.resize());
@@ -102,62 +100,35 @@ export class View3d {
 
   show(craft) {
     this.craft = craft;
-    this.clearCloud();
-    this.askCloud();
     this.fit();
   }
 
-  /** The station sends the cloud only while somebody looks at it. */
-  askCloud() {
-    if (!this.page.cloud || !this.craft) return;
-    const wanted = this.on ? this.craft.uav : null;
-    if (wanted === this.asked) return;
-    if (this.asked) this.page.link.ask({ t: "cloud", uav: this.asked, on: false });
-    this.asked = wanted;
-    if (wanted) this.page.link.ask({ t: "cloud", uav: wanted, on: true });
-  }
-
-  /** After a reconnect the station knows nothing of our wish. */
-  reconnected() {
-    this.asked = null;
-    this.clearCloud();
-    this.askCloud();
-  }
-
-  clearCloud() {
-    for (const number of [...this.submaps.keys()]) this.drop(number);
+  /** Take what the cloud has of a submap: points, another place, or (null) nothing any more. */
+  put(number, submap) {
+    const shown = this.submaps.get(number);
+    if (shown && shown.source !== submap?.points) this.drop(number);
+    if (submap && shown?.source !== submap.points) this.add(number, submap);
+    const cloud = this.submaps.get(number);
+    if (cloud) {
+      cloud.matrix.set(...submap.place, 0, 0, 0, 1);
+      cloud.matrixWorldNeedsUpdate = true;
+    }
+    this.dirty = true;
   }
 
   drop(number) {
     const cloud = this.submaps.get(number);
-    if (!cloud) return;
     this.submaps.delete(number);
     this.points -= cloud.count;
     this.scene.remove(cloud);
     cloud.geometry.dispose();
   }
 
-  /** Take a submap's frame: points (int16, centimetres in the submap) with colours (bytes), a new place, or its withdrawal. */
-  take(uav, data, at) {
-    if (!this.craft || uav !== this.craft.uav) return;
-    const head = new DataView(data, at), number = head.getUint32(0, true), kind = head.getUint32(4, true), count = head.getUint32(8, true);
-    this.dirty = true;
-    if (kind === REMOVED || kind === POINTS) this.drop(number);
-    if (kind === POINTS) this.add(number, count, data, at + HEAD_BYTES);
-    const cloud = this.submaps.get(number);
-    if (!cloud) return;
-    const m = Array.from({ length: 12 }, (_, k) => head.getFloat32(12 + 4 * k, true));
-    cloud.matrix.set(...m, 0, 0, 0, 1);
-    cloud.matrixWorldNeedsUpdate = true;
-  }
-
-  add(number, count, data, from) {
-    const steps = new Int16Array(data.slice(from, from + count * 6)), geometry = new BufferGeometry();
-    geometry.setAttribute("position", new BufferAttribute(Float32Array.from(steps, (v) => v / 100), 3));
-    geometry.setAttribute("color", new BufferAttribute(new Uint8Array(data.slice(from + count * 6, from + count * 9)), 3, true));
-    const cloud = new Points(geometry, this.cloudMaterial);
-    cloud.matrixAutoUpdate = false;
-    cloud.count = count;
+  add(number, { points, colours, count }) {
+    const geometry = new BufferGeometry();
+    geometry.setAttribute("position", new BufferAttribute(Float32Array.from(points, (v) => v / 100), 3));
+    geometry.setAttribute("color", new BufferAttribute(colours, 3, true));
+    const cloud = Object.assign(new Points(geometry, this.cloudMaterial), { source: points, count, matrixAutoUpdate: false });
     this.points += count;
     this.submaps.set(number, cloud);
     this.scene.add(cloud);
