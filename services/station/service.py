@@ -244,7 +244,7 @@ class Station:
             del self._clouds[uav]
 
     def _ask_again_for_clouds(self) -> None:
-        """A page may look before there is a mapper, or a map: ask now and then until something comes."""
+        """Ask now and then until something comes: a page may look before there is a mapper, or a map."""
         now_s = time.monotonic()
         for uav, view in self._clouds.items():
             if view.empty and now_s - self._clouds_asked_s.get(uav, 0.0) > _CLOUD_AGAIN_S:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 import sys
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
@@ -37,8 +37,10 @@ from services.common.runtime import LiveContext, run_service
 from services.common.stop import end_process
 from services.navigator.commands import CommandDesk
 from services.router.config import RouterConfig
-from tests.station.stub_camera import StubCamera
 from tests.unit.navigator_world import SERVICES, STEP_S, World, tree
+
+if TYPE_CHECKING:
+    from tests.station.stub_camera import StubCamera
 
 _COVARIANCE = tuple(
     {0: 4e-4, 6: 4e-4, 11: 4e-4, 15: 1e-5, 18: 1e-5, 20: 1e-5}.get(i, 0.0) for i in range(21)
@@ -97,7 +99,11 @@ class StubAircraft:
         self._reporters = {name: HealthReporter(name, context.health) for name in (*SERVICES, "navigator", "autopilot")}
         self._heard_station_s = -1.0
         self._ticks = 0
-        self._camera = StubCamera(self.world.trees, seed) if os.environ.get("STUB_CAMERA") else None
+        self._camera: StubCamera | None = None
+        if os.environ.get("STUB_CAMERA"):
+            from tests.station.stub_camera import StubCamera  # it takes seconds to load
+
+            self._camera = StubCamera(self.world.trees, seed)
 
     def register(self) -> None:
         c = self.context

@@ -148,7 +148,7 @@ def test_two_operators_one_in_command(ground: Ground, page: Page, browser: Brows
 def test_several_aircraft_side_by_side(ground: Ground, page: Page) -> None:
     for number in (1, 2):
         ground.aircraft(f"uav{number}", seed=number)
-    true(page, "window.treedock.crafts.size === 2", 15.0)
+    true(page, "window.treedock.crafts.size === 2", 60.0)
     page.click(".chip >> nth=0")
     assert page.locator(".tile").count() == 2
     page.click(".tile >> nth=1")

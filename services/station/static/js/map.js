@@ -112,8 +112,8 @@ export class MapView {
     c.fillStyle = this.colours.map;
     c.fillRect(0, 0, this.width, this.height);
     const craft = this.craft;
-    if (craft) this.drawCells(c, craft.seen, craft.seen.image(this.colours.seen));
-    if (craft && this.obstacles) this.drawCells(c, this.obstacles, this.obstacles.image(this.colours.solid, now));
+    if (craft) this.drawCells(c, craft.seen, craft.seen.image(this.colours.seen), true);
+    if (craft && this.obstacles) this.drawCells(c, this.obstacles, this.obstacles.image(this.colours.solid, now), false);
     this.drawGrid(c);
     if (!craft) return;
     this.drawTrail(c, craft);
@@ -126,13 +126,14 @@ export class MapView {
   }
 
   /** Draw a raster of cells about the origin. */
-  drawCells(c, { size, cell }, image) {
+  drawCells(c, { size, cell }, image, soft) {
     const side = size * cell * this.scale, [u, v] = this.px(0, 0);
     c.save();
     c.translate(u, v);
     c.rotate(-Math.PI / 2); // the image has x to the right
-    c.imageSmoothingEnabled = true;
-    c.drawImage(image, -side / 2, -side / 2, side, side);
+    c.imageSmoothingEnabled = soft;
+    const half = (cell * this.scale) / 2; // a cell lies about its point
+    c.drawImage(image, -side / 2 - half, -side / 2 - half, side, side);
     c.restore();
   }
 
