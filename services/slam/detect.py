@@ -27,8 +27,8 @@ _POOR = 0.5
 _STRETCH_BLUR_PX = 1.5
 _STRETCH_LEVEL = 3
 """The finest level searched in a stretched image: what is smaller is blurred away, and its corners lie where noise put them."""
-_STRETCH_TO, _STRETCH_MOST = 40.0, 8.0
-"""The standard deviation of grey values that the stretched image has, and how much it is stretched at most."""
+_STRETCH_TO, _STRETCH_LEAST, _STRETCH_MOST = 40.0, 2.0, 8.0
+"""The standard deviation of grey values that the stretched image has, and how much it is stretched at least and at most."""
 _PATCH_RADIUS = 15
 _TENSOR_RADIUS = 3
 
@@ -134,13 +134,19 @@ def orient(image: U8, xy: F32) -> F64:
     return out
 
 
-def stretch(image: U8) -> U8:
-    """Return a flat image with more contrast: fog, dusk, a bare wall. Blurred first, or the sensor's noise would make the corners."""
+def stretch(image: U8) -> U8 | None:
+    """Return a flat image with more contrast: fog, dusk, a bare wall; None for one that is not flat.
+
+    Blurred first, or the sensor's noise would make the corners. An image smeared by motion has contrast and few corners: more
+    of them would lie where the smear put them.
+    """
     import cv2
 
     soft = cv2.GaussianBlur(image.astype(np.float32), (0, 0), _STRETCH_BLUR_PX)
     mean, deviation = (float(value[0, 0]) for value in cv2.meanStdDev(soft))
-    gain = min(max(_STRETCH_TO / max(deviation, 1e-6), 1.0), _STRETCH_MOST)
+    gain = min(_STRETCH_TO / max(deviation, 1e-6), _STRETCH_MOST)
+    if gain < _STRETCH_LEAST:
+        return None
     return np.clip(128.0 + gain * (soft - mean), 0.0, 255.0).astype(np.uint8)
 
 
@@ -181,8 +187,8 @@ class Detector:
         found = self._search(image, depth_m, self._quota)
         if len(found[0]) >= _POOR * self._quota.sum():
             return image, found
-        image = stretch(image)
-        return image, self._search(image, depth_m, self._coarse)
+        stretched = stretch(image)
+        return (image, found) if stretched is None else (stretched, self._search(stretched, depth_m, self._coarse))
 
     def _search(self, image: U8, depth_m: F32, quota: I64) -> tuple[F64, F64, F64, NDArray[np.int32]]:
         """Return up to ``quota`` (levels,) corners of each level."""

@@ -13,7 +13,7 @@ from services.evaluate.bench_slam import run_slam
 DATA = Path(os.environ.get("TREEDOCK_DATA") or Path(__file__).parents[2].parent / "shared" / "data")
 
 
-@pytest.mark.parametrize(("folder", "limit_m"), [("tum_fr1_xyz_15hz", 0.015), ("tum_fr1_desk_15hz", 0.025)])
+@pytest.mark.parametrize(("folder", "limit_m"), [("tum_fr1_xyz_15hz", 0.010), ("tum_fr1_desk_15hz", 0.018)])
 def test_real_recording_is_tracked_whole_and_accurate(folder: str, limit_m: float) -> None:
     sequence = DATA / folder
     if not sequence.is_dir():

@@ -57,6 +57,16 @@ def test_a_clear_image_is_searched_as_it_is() -> None:
 
 
 def test_an_empty_image_is_not_stretched_without_bounds() -> None:
-    noise = np.random.default_rng(1).integers(126, 130, (480, 640), dtype=np.uint8)
-    assert stretch(noise).std() < 8.0
-    assert np.ptp(stretch(np.full((480, 640), 7, np.uint8))) == 0
+    noise = stretch(np.random.default_rng(1).integers(126, 130, (480, 640), dtype=np.uint8))
+    assert noise is not None
+    assert noise.std() < 8.0
+    even = stretch(np.full((480, 640), 7, np.uint8))
+    assert even is not None
+    assert np.ptp(even) == 0
+
+
+def test_an_image_smeared_by_motion_is_not_stretched() -> None:
+    smeared = cv2.blur(clear(), (31, 1)).astype(np.uint8)
+    assert stretch(smeared) is None
+    searched, _ = Detector(992, 8, 1.2, 19, 7).detect(smeared, DEPTH_M)
+    assert searched is smeared
