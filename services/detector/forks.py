@@ -14,7 +14,7 @@ from services.detector.stacks import Stack
 BENT = "lie on one line: a fork, or a bush"
 """How the reason ends for which a bent candidate is dropped."""
 _MIN_ANGLE_RAD = 0.14
-_SEEN_FROM_M = 0.3
+_SEEN_FROM_M = 0.15
 """An arm begins at least so far above where its stem is seen to begin."""
 
 

@@ -20,8 +20,8 @@ from services.detector.upright import Upright
 Ints32 = NDArray[np.int32]
 
 _MAX_CELLS = 2_000_000
-_SAMPLE = 80_000
-_SAMPLE_PER_CELL = 60
+_SAMPLE = 40_000
+_SAMPLE_PER_CELL = 30
 """So many points tell where the surface lies in its cell."""
 
 

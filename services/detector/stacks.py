@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from statistics import median
 
 import numpy as np
 from numba import njit
@@ -184,7 +185,7 @@ def _as_stack(circles: Circles, tol_all: Floats, members: Ints) -> Stack:
     layers = circles.layer[members]
     extent = int(layers.max() - layers.min()) + 1
     return Stack(
-        at, slope, float(np.median(radius)), float(np.median(circles.range_m[members])), float(xyz[:, 2].min()), float(xyz[:, 2].max()), len(members),
+        at, slope, median(radius.tolist()), median(circles.range_m[members].tolist()), float(xyz[:, 2].min()), float(xyz[:, 2].max()), len(members),
         len(members) / extent,
     )  # fmt: skip
 
