@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from services.common.errors import InputError
 from services.evaluate.faults.missions import Flights
 from services.evaluate.faults.rig import ONBOARD, Rig
 from services.evaluate.faults.system import flight_config
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from services.evaluate.faults.chain import Chain
 
 GROUND = ("preview", "station")
+_READY_WITHIN_S = 300.0
 
 
 @dataclass
@@ -63,6 +65,8 @@ class Bench:
             rig = self._stack.enter_context(
                 Rig(flight_config(self.seed, folder), folder, (*ONBOARD, *GROUND, "simulator"))
             )
+            if not rig.until(lambda: rig.all_ready, _READY_WITHIN_S):
+                raise InputError(f"not ready within {_READY_WITHIN_S:.0f} s: see {folder}")
             self._flights = Flights(rig, self.rng(row), self.tell)
         self._flights.rng = self.rng(row)
         return self._flights
