@@ -23,7 +23,7 @@ def fine_section(result: FineResult, trees: Sequence[Tree]) -> list[str]:
     head = [
         "<h2>Finer map</h2>",
         f"<p>All {result.frames} located frames fused after the flight: {_number(len(result.cloud.points_m))} points "
-        f"({_number(int(result.cloud.fine.sum()))} of them around stems), {_number(int(result.segments.ground.sum()))} of the ground.</p>",
+        f"({_number(int(result.cloud.fine.sum()))} of them around stems), {_number(int(result.segments.ground.sum()))} of the ground. Files: fine_cloud.laz (points with the number of their tree), trees_fine.json, trees_fine.csv, sections_fine.csv, ground_fine.asc (where ground shows).</p>",
     ]
     if not result.stems:
         return [*head, "<p>No stem was seen well enough to be measured.</p>"]
@@ -31,7 +31,7 @@ def fine_section(result: FineResult, trees: Sequence[Tree]) -> list[str]:
     shown = sorted(result.stems, key=lambda stem: (not stem.suitable, stem.tree_id))[:_MAX_PICTURES]
     words = (
         "Diameters along each stem: dots are sections of 10 cm with one standard deviation, the line is the taper function; pale dots "
-        "are not used for it (root flare, branches). Below, points of the fine cloud at breast height and the circle there."
+        "are not used for it (root flare, branches). Beside, points of the fine cloud at breast height and the circle there."
     )
     pictures = [f"<div>{profile_svg(stem)}{_breast_height(stem, live[stem.tree_id], result)}</div>" for stem in shown]
     return [
