@@ -48,7 +48,7 @@ class System:
 
     @contextlib.contextmanager
     def session(self) -> Iterator[zenoh.Session]:
-        with opened_client(self.endpoint, lambda: False, wait_s=10.0) as session:
+        with opened_client(self.endpoint, lambda: False, wait_s=60.0) as session:
             yield session
 
     @contextlib.contextmanager
