@@ -139,13 +139,17 @@ class Conductor:
             self.word = self.word or "the pictures ended before the mission could begin"
             return True
         if not self._started:
-            if ready and self._able and now_s - self._asked_s >= _ASK_AGAIN_S:
+            lacking = self._lacking
+            if ready and lacking:
+                self.word = lacking
+            elif ready and now_s - self._asked_s >= _ASK_AGAIN_S:
                 self._asked_s = now_s
                 self._start()
         elif self._over and self._ended_s is None:
             self._ended_s = now_s
         if now_s - self._begin_s > self._within_s:
-            self.word = f"not ended within {self._within_s:.0f} s"
+            begun = "ended" if self._started else "begun"
+            self.word = f"not {begun} within {self._within_s:.0f} s{self.word and ': '}{self.word}"
             return True
         if self._ended_s is None:
             return False
@@ -160,10 +164,14 @@ class Conductor:
         return self.flown.states[-1].state if self.flown.states else "idle"
 
     @property
-    def _able(self) -> bool:
+    def _lacking(self) -> str:
+        """What must come before the start can be ordered, in words; empty when all is there."""
         pose, vehicle = self._watch.pose, self.vehicle
-        tracking = pose is not None and pose.status == "tracking"
-        return tracking and (self._handheld or (vehicle is not None and vehicle.connected))
+        if not self._handheld and (vehicle is None or not vehicle.connected):
+            return "waiting for the autopilot to speak: is it running, does it send MAVLink to this address?"
+        if pose is None or pose.status != "tracking":
+            return "waiting for slam's first pose: does the camera see something?"
+        return ""
 
     @property
     def _sources_end(self) -> bool:

@@ -157,8 +157,10 @@ class NavigatorConfig(BaseModel):
     """Which of the camera's two keys the guard takes: ``compressed`` where the camera is on another machine."""
     guard_height_m: float = Field(default=0.25, gt=0.0)
     """Half height of the aircraft with margin, for the live guard."""
-    preflight_wait_s: float = Field(default=30.0, gt=0.0)
-    arm_wait_s: float = Field(default=20.0, gt=0.0)
+    preflight_wait_s: float = Field(default=60.0, gt=0.0)
+    """PX4 takes 5 to 20 s to use the vision pose, and longer when it is still starting."""
+    arm_wait_s: float = Field(default=40.0, gt=0.0)
+    """More than the bridge spends on mode and arming (autopilot.engage_timeout_s each): it knows the reason."""
     takeoff_wait_s: float = Field(default=30.0, gt=0.0)
     nonce_valid_s: float = Field(default=10.0, gt=0.0)
     ground_required: bool = False

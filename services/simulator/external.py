@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
+from collections import deque
 from os import getpid
 
 import numpy as np
@@ -26,12 +27,15 @@ _STAMP_BYTES = 8
 _SMOOTHING = 0.25
 """Share of a told position's deviation from the predicted one that is taken over: it resolves 1.1 cm only."""
 _JUMP_M = 1.0
+_WINDOW_S = 0.25
+"""Accelerations are slopes over this long: the told speeds are whole centimetres per second."""
 
 
 class TruthTrack:
     """The aircraft's true pose in our world, ``T_world_body`` (4, 4) FLU, from HIL_STATE_QUATERNION.
 
-    The first message is taken for the start: its place and heading become ``T_world_start``'s.
+    The first whole message is taken for the start: its place and heading become ``T_world_start``'s. The messages carry
+    no stamp (PX4 leaves ``time_usec`` at 0): their time is that of their arrival.
     """
 
     def __init__(self, T_world_start: Matrix) -> None:
@@ -43,13 +47,18 @@ class TruthTrack:
         self.acceleration_m_s2 = np.zeros(3)
         """Of the body in the world, gravity not included."""
         self._velocity_m_s = np.zeros(3)
+        self._window: deque[tuple[float, Matrix]] = deque()
 
-    def take(self, told: m.MAVLink_hil_state_quaternion_message) -> Matrix:
-        """Take a message and return the pose."""
+    def take(self, told: m.MAVLink_hil_state_quaternion_message, time_s: float) -> Matrix | None:
+        """Take a message that arrived at ``time_s`` and return the pose; None while it does not hold one yet.
+
+        A PX4 that boots tells zeros for what it does not know: a quaternion without length, the place 0, 0.
+        """
+        if not 0.9 < float(np.linalg.norm(told.attitude_quaternion)) < 1.1 or (told.lat == 0 and told.lon == 0):
+            return None
         place = (told.lat * 1e-7, told.lon * 1e-7, told.alt * 1e-3)
         R = FLIP @ rotation_from_wxyz(np.array(told.attitude_quaternion)) @ FLIP
         velocity = FLIP @ np.array([told.vx, told.vy, told.vz]) * 0.01
-        time_s = told.time_usec * 1e-6
         if self._origin is None:
             self._origin, self._position_m = place, np.zeros(3)
             turn = np.arctan2(self._T_world_start[1, 0], self._T_world_start[0, 0]) - np.arctan2(R[1, 0], R[0, 0])
@@ -57,6 +66,7 @@ class TruthTrack:
         else:
             self._follow(FLIP @ np.array(to_local(self._origin, place)), velocity, time_s - self._time_s)
         self._time_s, self._velocity_m_s = time_s, velocity
+        self._accelerate(time_s, velocity)
         return self._T_world_local @ pose(R, self._position_m)
 
     def _follow(self, told_m: Matrix, velocity_m_s: Matrix, dt_s: float) -> None:
@@ -64,9 +74,17 @@ class TruthTrack:
         predicted = self._position_m + 0.5 * (velocity_m_s + self._velocity_m_s) * dt_s
         off = told_m - predicted
         self._position_m = told_m if np.linalg.norm(off) > _JUMP_M else predicted + _SMOOTHING * off
-        if dt_s > 0.0:
-            change = self._T_world_local[:3, :3] @ (velocity_m_s - self._velocity_m_s) / dt_s
-            self.acceleration_m_s2 = 0.7 * self.acceleration_m_s2 + 0.3 * change
+
+    def _accelerate(self, time_s: float, velocity_m_s: Matrix) -> None:
+        """Take the slope of the speeds of the last moments."""
+        self._window.append((time_s, velocity_m_s))
+        while time_s - self._window[0][0] > _WINDOW_S:
+            self._window.popleft()
+        t = np.array([at for at, _ in self._window])
+        t -= t.mean()
+        spread = float(t @ t)
+        slope = t @ np.array([v for _, v in self._window]) / spread if spread > 1e-6 else np.zeros(3)
+        self.acceleration_m_s2 = self._T_world_local[:3, :3] @ slope
 
 
 class ExternalFlight:
@@ -113,7 +131,10 @@ class ExternalFlight:
             stamp_ns = int.from_bytes(data[:_STAMP_BYTES], "little")
             for message in self._parser.parse_buffer(data[_STAMP_BYTES:]) or ():
                 if isinstance(message, m.MAVLink_hil_state_quaternion_message):
-                    self._T_world_body = self._track.take(message)
+                    T_world_body = self._track.take(message, stamp_ns * 1e-9)
+                    if T_world_body is None:
+                        continue
+                    self._T_world_body = T_world_body
                     self._stamp_ns = stamp_ns + self._context.clock.now_ns() - time.monotonic_ns()
         if self._T_world_body is not None and self._stamp_ns > self._sent_ns and self._stamp_ns >= self._due_ns:
             self._send(self._T_world_body)

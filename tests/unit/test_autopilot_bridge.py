@@ -266,7 +266,7 @@ def test_refused_arming_gives_up() -> None:
     rig.run(1.5)
     rig.obedient = False
     rig.guidance = {"engage": True, "mission_id": 1}
-    rig.run(12.0)
+    rig.run(15.0)
     assert rig.bridge.engagement.phase == "quiet"
     assert not rig.setpoints(1.0)
 

@@ -69,7 +69,7 @@ def test_nobody_engages_beside_another() -> None:
     rig.guidance = {"engage": False, "mission_id": 1}
     rig.run(1.5)
     rig.guidance = {"engage": True, "mission_id": 1}
-    for _ in range(100):
+    for _ in range(130):
         rig.bridge.handle(_setpoint_of(), rig.now_ns)
         rig.run(0.1)
     assert not rig.armed
@@ -107,7 +107,7 @@ def test_refused_arming_says_what_the_autopilot_answered() -> None:
     rig.obedient = False
     rig.run(1.7)
     rig.mode = 6 << 16
-    for _ in range(95):
+    for _ in range(130):
         rig.bridge.handle(_from(mav.MAVLink_command_ack_message(400, 1), 1, 1), rig.now_ns)
         rig.run(0.1)
     assert "temporarily rejected" in rig.bridge.engagement.note

@@ -143,6 +143,8 @@ def test_handheld_starts_without_a_vehicle_and_ends_with_the_pictures(monkeypatc
     assert not pilot.update(ready=True)
     assert person._started
     assert not pilot._started, "nobody flies without a vehicle"
+    assert "autopilot" in pilot.word
+    assert "is it running" in pilot.word
     watch.source_ended = True
     assert person.update(ready=True)
     late = Conductor(watch, 60.0, handheld=True)

@@ -58,6 +58,21 @@ def test_operator_takes_over_at_any_moment(state: str) -> None:
     world.override = False
     world.run(seconds=20.0)
     assert world.state == "released", "it resumed by itself"
+
+
+def test_disarmed_by_another_releases() -> None:
+    world = _flying("approach")
+    world.armed = False
+    world.step()
+    world.run(seconds=0.2)
+    assert world.state == "released"
+    assert "disarmed, not by us" in world.mission.reason
+    assert world.outputs is not None
+    assert not world.outputs.guidance.engage
+    armings = world.armings
+    world.run(seconds=20.0)
+    assert world.state == "released"
+    assert world.armings == armings
     assert world.armings == 1
 
 
@@ -251,7 +266,7 @@ def test_battery_low_lands() -> None:
 def test_low_battery_does_not_take_off() -> None:
     world = World(battery=0.3)
     world.start()
-    assert world.run("failed", 60.0) == "failed"
+    assert world.run("failed", 70.0) == "failed"
     assert "battery" in world.mission.reason
     assert world.armings == 0
 

@@ -136,7 +136,8 @@ def test_the_told_pose_begins_at_the_scenes_start_whatever_px4s_own_is() -> None
     start = pose(rotation_z(0.7), (0.0, 0.0, 0.35))
     px4 = SimulatedPx4(lambda _x, _y: 0.0, pose(rotation_z(-2.0), (3.0, -1.0, 0.1)), Px4Config(links=()), 1)
     track = TruthTrack(start)
-    T = track.take(hil_state_quaternion(px4.vehicle))
+    T = track.take(hil_state_quaternion(px4.vehicle), 5.0)
+    assert T is not None
     assert np.allclose(T[:3, 3], start[:3, 3], atol=1e-6)
     assert camera_yaw(camera_of(T)) == pytest.approx(0.7, abs=1e-3)
 
@@ -145,13 +146,37 @@ def test_a_flown_path_is_followed_to_a_centimetre() -> None:
     """The position comes in steps of 1.1 cm; smoothed with the told velocity it is better than that."""
     start = pose(rotation_z(0.7), (0.0, 0.0, 0.1))
     px4 = SimulatedPx4(lambda _x, _y: 0.0, start, Px4Config(links=()), 1)
-    track, off = TruthTrack(start), []
+    track, off, pulled = TruthTrack(start), [], []
+    late_s = np.random.default_rng(1).uniform(0.0, 0.004, 500)
     for i in range(500):
         t = 0.02 * i
         body = px4.vehicle.body.state
         body[:3] = (np.sin(t), 0.5 * np.sin(0.7 * t), -0.1 - 0.3 * (1.0 - np.cos(t)))
         body[3:6] = (np.cos(t), 0.35 * np.cos(0.7 * t), -0.3 * np.sin(t))
         px4.vehicle.ticks = 5 * i
-        T = track.take(hil_state_quaternion(px4.vehicle))
+        T = track.take(hil_state_quaternion(px4.vehicle), 1000.0 + t + float(late_s[i]))
+        assert T is not None
         off.append(np.linalg.norm(T[:3, 3] - px4.true_pose()[:3, 3]))
+        before = t - 0.125  # the middle of the window
+        true = np.array([-np.sin(before), 0.245 * np.sin(0.7 * before), 0.3 * np.cos(before)])
+        pulled.append(np.linalg.norm(track.acceleration_m_s2 - true))
     assert np.percentile(off[50:], 95) < 0.01
+    assert np.percentile(pulled[50:], 95) < 0.1
+
+
+def test_a_px4_that_boots_has_no_pose_yet() -> None:
+    """It tells zeros for what it does not know; the start is the first whole message."""
+    start = pose(rotation_z(0.7), (0.0, 0.0, 0.1))
+    px4 = SimulatedPx4(lambda _x, _y: 0.0, start, Px4Config(links=()), 1)
+    whole = hil_state_quaternion(px4.vehicle)
+    track = TruthTrack(start)
+    for left_out in ("attitude_quaternion", "place"):
+        told = hil_state_quaternion(px4.vehicle)
+        if left_out == "place":
+            told.lat = told.lon = told.alt = 0
+        else:
+            told.attitude_quaternion = [0.0] * 4
+        assert track.take(told, 1.0) is None
+    T = track.take(whole, 2.0)
+    assert T is not None
+    assert np.allclose(T[:3, 3], start[:3, 3])

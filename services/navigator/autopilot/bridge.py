@@ -29,7 +29,10 @@ from services.navigator.track import Correction, Step
 _HEARTBEAT_NS = 1_000_000_000
 _ASK_AGAIN_NS = 2_000_000_000
 _AGREE_NS = 50_000_000
-_ORIGINS = 30
+_MODE_NS = 100_000_000
+"""In flight the heartbeat is asked for this often, so that a pilot who takes over is noticed in 0.1 s instead of 1 s."""
+_ORIGINS, _ORIGIN_QUESTIONS = 30, 2
+_SET_THEM = "Set them, or start with --set autopilot.set_parameters=true; then start the autopilot again"
 _AHEAD_S = 0.15
 """A setpoint is carried on along its velocity for at most this long after its guidance was made."""
 _USE_POSITION_VELOCITY_YAW_RATE = 448
@@ -42,13 +45,13 @@ class Bridge:
     def __init__(self, config: AutopilotConfig) -> None:
         self.config = config
         self.mount = Mount.level(config.camera_offset_m, config.camera_pitch_rad, config.camera_yaw_rad)
-        self.telemetry = Telemetry()
+        self.telemetry = Telemetry(config.component_id)
         self.vision = Vision(config, self.mount)
         self.engagement = Engagement(config)
         self.parameters = ParameterReader(config.vehicle, change=config.set_parameters)
         self.clocks = ClockCheck()
         self.foreign = Foreign(config.component_id)
-        self._origins_sent = 0
+        self._origins_sent = self._origins_asked = 0
         self.setpoints_sent = 0
         self.setpoints_refused = 0
         self._far = ""
@@ -59,7 +62,8 @@ class Bridge:
         """Guidance made before this is in a map that cannot be related to the present one."""
         self._held: tuple[Matrix, float] | None = None
         self._sent: tuple[Matrix, float] | None = None
-        self._due = {"heartbeat": 0, "setpoint": 0, "ask": 0, "agree": 0}
+        self._due = {"heartbeat": 0, "setpoint": 0, "ask": 0, "agree": 0, "mode": 0}
+        self._outages = 0
         self._seq = 0
 
     # -- in -----------------------------------------------------------------------------------------------------
@@ -88,6 +92,9 @@ class Bridge:
         if not self.telemetry.take(message, received_ns):
             self.foreign.hear(message, self.telemetry.system, received_ns)
             return
+        if self.telemetry.outages != self._outages:
+            self._outages = self.telemetry.outages
+            self._begin_anew()
         kind = message.get_type()
         if kind == "PARAM_VALUE":
             self.parameters.take(message.param_id, message.param_value, message.param_type)
@@ -96,6 +103,13 @@ class Bridge:
             self.clocks.take(message, received_ns)
         elif kind == "POSITION_TARGET_LOCAL_NED" and self.engagement.phase == "engaged":
             self.foreign.flown_to(message, received_ns)
+
+    def _begin_anew(self) -> None:
+        """Ask the autopilot everything again: it was silent for so long that it may have been started again."""
+        self.parameters = ParameterReader(self.config.vehicle, change=self.config.set_parameters)
+        self._wrong = refusals({}, self.config.vehicle)
+        self.clocks = ClockCheck()
+        self._origins_sent = self._origins_asked = 0
 
     # -- out ----------------------------------------------------------------------------------------------------
     def tick(self, now_ns: int) -> list[Any]:
@@ -108,9 +122,12 @@ class Bridge:
             return out
         if self._is_due("ask", now_ns, _ASK_AGAIN_NS):
             out.extend(self._requests(system, now_ns))
+        flying = self.engagement.phase not in ("quiet", "released")
+        if flying and self._is_due("mode", now_ns, _MODE_NS):
+            out.append(px4.request(mav.MAVLINK_MSG_ID_HEARTBEAT, system))
         out.extend(self.clocks.due(now_ns))
         if self.config.check_parameters:
-            still = not self.telemetry.armed and self.engagement.phase in ("quiet", "released")
+            still = not self.telemetry.armed and not flying
             out.extend(self.parameters.due(system, now_ns, may_set=still))
         odometry = self.vision.message(now_ns)
         if odometry is not None:
@@ -139,7 +156,7 @@ class Bridge:
             return ""
         if not self.parameters.complete:
             return "parameters are still being read"
-        return f"parameters: {'; '.join(self._wrong)}" if self._wrong else ""
+        return f"parameters: {'; '.join(self._wrong)}. {_SET_THEM}" if self._wrong else ""
 
     def state(self, now_ns: int) -> VehicleState:
         """Return the vehicle state for the bus."""
@@ -168,6 +185,11 @@ class Bridge:
         # never in flight: a new origin may move PX4's estimate
         on_ground = not self.telemetry.armed and self.telemetry.landed != "in_air"
         if not self.telemetry.origin_known and on_ground and self._origins_sent < _ORIGINS:
+            # it tells an origin it has only when asked, or once; it is not given another one
+            out.append(px4.request(mav.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN, system))
+            self._origins_asked += 1
+            if self._origins_asked <= _ORIGIN_QUESTIONS:
+                return out
             self._origins_sent += 1
             c = self.config
             lat, lon, alt = round(c.origin_lat_deg * 1e7), round(c.origin_lon_deg * 1e7), round(c.origin_alt_m * 1e3)

@@ -53,4 +53,5 @@ class AutopilotConfig(BaseModel):
     """Without guidance for this long: land. Longer than a navigator takes to be started again."""
     link_lost_s: float = Field(default=1.0, gt=0.0)
     stream_before_offboard_s: float = Field(default=1.5, gt=1.0)
-    engage_timeout_s: float = Field(default=8.0, gt=0.0)
+    engage_timeout_s: float = Field(default=12.0, gt=0.0)
+    """Patience with each of vision, mode and arming, asked for again and again: PX4's checks pass late after its start."""

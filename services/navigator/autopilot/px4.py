@@ -24,7 +24,6 @@ _CODES = {OFFBOARD: (6, 0), LAND: (4, 6), HOLD: (4, 3)}
 AUTOPILOT_COMPONENT = 1
 
 STREAMS_HZ: dict[int, float] = {
-    mav.MAVLINK_MSG_ID_HEARTBEAT: 10.0,
     mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 20.0,
     mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 20.0,
     mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
@@ -32,8 +31,7 @@ STREAMS_HZ: dict[int, float] = {
     mav.MAVLINK_MSG_ID_SYS_STATUS: 2.0,
     mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: 5.0,
 }
-"""What we ask for with SET_MESSAGE_INTERVAL. The heartbeat at 10 Hz, so that a pilot who takes over is noticed in
-0.1 s instead of 1 s."""
+"""What we ask for with SET_MESSAGE_INTERVAL. Not the heartbeat: PX4 lets nobody change its rate of 1 Hz."""
 
 
 def mode_name(custom_mode: int) -> str:
@@ -59,6 +57,11 @@ def arm(system: int, *, on: bool) -> mav.MAVLink_command_long_message:
 def interval(message_id: int, rate_hz: float, system: int) -> mav.MAVLink_command_long_message:
     """Return the order to send a message at a rate."""
     return command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, system, float(message_id), 1e6 / rate_hz)
+
+
+def request(message_id: int, system: int) -> mav.MAVLink_command_long_message:
+    """Return the order to send a message once, now; PX4 answers for its heartbeat, too."""
+    return command(mav.MAV_CMD_REQUEST_MESSAGE, system, float(message_id))
 
 
 def command(number: int, system: int, *parameters: float) -> mav.MAVLink_command_long_message:

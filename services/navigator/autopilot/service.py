@@ -25,7 +25,8 @@ class Autopilot:
         self._context = context
         self._link = link
         self.bridge = Bridge(config)
-        self._identified = False
+        self._identified: int | None = None
+        """The system as whose component we speak."""
         self._note = ""
         self._table_told = False
         self._told = 0
@@ -43,9 +44,10 @@ class Autopilot:
         """Take what came from the autopilot and send what is due."""
         for message, received_ns in self._link.poll():
             self.bridge.handle(message, received_ns)
-        if not self._identified and self.bridge.telemetry.system is not None:
-            self._link.identify(self.bridge.telemetry.system)
-            self._identified = True
+        system = self.bridge.telemetry.system
+        if system is not None and system != self._identified:
+            self._link.identify(system)
+            self._identified = system
         self._send()
 
     def _send(self) -> None:

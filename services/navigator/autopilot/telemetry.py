@@ -24,13 +24,20 @@ _RESULTS = {
 _FUSED_FLAGS = mav.ESTIMATOR_POS_HORIZ_REL | mav.ESTIMATOR_POS_HORIZ_ABS
 _AGREE_M, _AGREE_RAD, _AGREE_S = 0.4, math.radians(20.0), 0.5
 _FRESH_S = 1.0
+_STARTED_AGAIN_NS = 2_000_000_000
 
 
 class Telemetry:
-    """The latest of each message of the autopilot; ``*_ns`` are times of arrival on our clock."""
+    """The latest of each message of the autopilot; ``*_ns`` are times of arrival on our clock.
 
-    def __init__(self) -> None:
+    ``component`` is ours: acknowledgements for others are not noted.
+    """
+
+    def __init__(self, component: int) -> None:
+        self._component = component
         self.system: int | None = None
+        self.outages = 0
+        """How often the autopilot came back after a silence long enough for it to have been started again."""
         self.heard_ns: int | None = None
         self.armed = False
         self.mode = "unknown"
@@ -45,6 +52,8 @@ class Telemetry:
         self.failsafe = False
         self.may_arm: bool | None = None
         """The autopilot's own verdict on arming, where it tells one."""
+        self.said = ""
+        """The last warning it sent; PX4 sends them on a ground station's links only."""
         self.came_ns: dict[int, int] = {}
         """Last arrival of each message id."""
         self.acks: dict[int, int] = {}
@@ -54,7 +63,8 @@ class Telemetry:
     def take(self, message: Any, received_ns: int) -> bool:  # noqa: ANN401 - pymavlink's classes share no typed base
         """Take a message; False when it is not of the autopilot we talk to."""
         system, component = message.get_srcSystem(), message.get_srcComponent()
-        if component != AUTOPILOT_COMPONENT or (self.system is not None and system != self.system):
+        gone = self.heard_ns is not None and received_ns - self.heard_ns > _STARTED_AGAIN_NS
+        if component != AUTOPILOT_COMPONENT or (self.system is not None and system != self.system and not gone):
             return False
         kind = message.get_type()
         if kind == "HEARTBEAT":
@@ -64,14 +74,24 @@ class Telemetry:
             self.armed = bool(message.base_mode & mav.MAV_MODE_FLAG_SAFETY_ARMED)
             self.mode = mode_name(message.custom_mode)
             self.failsafe = message.system_status in (mav.MAV_STATE_CRITICAL, mav.MAV_STATE_EMERGENCY)
-        if self.system is None:
+        if self.system is None or system != self.system:
             return False
+        if gone:
+            self._begin_anew()
         self.heard_ns = received_ns
         self.came_ns[message.get_msgId()] = received_ns
         reader = getattr(self, f"_on_{kind.lower()}", None)
         if reader is not None:
             reader(message, received_ns)
         return True
+
+    def _begin_anew(self) -> None:
+        """Forget what another start of the autopilot may have changed: streams, origin, acknowledgements."""
+        self.outages += 1
+        self.origin_known, self.estimator_flags, self.may_arm = False, None, None
+        self.acks.clear()
+        self.came_ns.clear()
+        self._agrees_since_ns = None
 
     def age_s(self, now_ns: int) -> float:
         """Return the seconds since the autopilot spoke, inf before."""
@@ -99,9 +119,12 @@ class Telemetry:
     def arming_word(self) -> str:
         """What the autopilot answered when asked to arm, and what it says of its checks; empty when it is content."""
         result = self.acks.get(mav.MAV_CMD_COMPONENT_ARM_DISARM, mav.MAV_RESULT_ACCEPTED)
-        words = [] if result == mav.MAV_RESULT_ACCEPTED else [_RESULTS.get(result, f"result {result}")]
+        content = result in (mav.MAV_RESULT_ACCEPTED, mav.MAV_RESULT_IN_PROGRESS)
+        words = [] if content else [_RESULTS.get(result, f"result {result}")]
         if self.may_arm is False:
-            words.append("its pre-arm checks fail (its ground station shows why)")
+            words.append("its pre-arm checks fail (its ground station, or `commander check` in its shell, shows why)")
+        if words and self.said:
+            words.append(f"it says: {self.said}")
         return ", ".join(words)
 
     def state(
@@ -154,8 +177,14 @@ class Telemetry:
         del message
         self.origin_known = True
 
+    def _on_statustext(self, message: Any, _: int) -> None:  # noqa: ANN401
+        if message.severity <= mav.MAV_SEVERITY_WARNING:
+            self.said = str(message.text).rstrip("\0")[:100]
+
     def _on_command_ack(self, message: Any, _: int) -> None:  # noqa: ANN401
-        self.acks[int(message.command)] = int(message.result)
+        for_us = message.target_system in (0, self.system) and message.target_component in (0, self._component)
+        if for_us:
+            self.acks[int(message.command)] = int(message.result)
 
 
 def _yaw(R_map_body: Matrix) -> float:

@@ -44,6 +44,8 @@ class Port:
         self.unpackable = 0
         self.parameters: list[Parameter] = []
         self.late_acks: list[tuple[float, Message]] = []
+        self.origin_told: tuple[float, float, float] | None = None
+        """An origin is told once, and when it is asked for."""
 
     def send(self, message: Message) -> None:
         """Pack with this link's sequence number and send; what does not fit its fields (1e9 m away) is dropped."""
@@ -56,9 +58,9 @@ class Port:
         self.mav.seq = (self.mav.seq + 1) % 256
 
     def set_interval(self, ident: int, interval_us: float, now_s: float) -> bool:
-        """Set a stream's interval: -1 stops it, 0 restores its default; False for a message we do not have."""
-        if ident not in BUILDERS:
-            return False
+        """Set a stream's interval: -1 stops it, 0 restores its default; False for what has none of its own."""
+        if ident not in BUILDERS or ident == m.MAVLINK_MSG_ID_HEARTBEAT:
+            return False  # the heartbeat's rate is fixed
         default = RATES_HZ.get(ident)
         interval_s = interval_us * 1e-6 if interval_us > 0.0 else (1.0 / default if default else math.inf)
         if not interval_us >= 0.0 or not math.isfinite(interval_s):
@@ -152,6 +154,8 @@ class MavlinkServer:
             for ident, interval_s in list(port.intervals_s.items()):
                 if now_s + 1e-9 >= port.due_s[ident] and (port.heard or ident == m.MAVLINK_MSG_ID_HEARTBEAT):
                     port.due_s[ident] = max(port.due_s[ident] + interval_s, now_s)
+                    if ident == m.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN and port.origin_told == self.vehicle.origin:
+                        continue
                     self._tell(port, ident)
             for parameter in port.parameters[:_PARAM_BURST]:
                 self._send_parameter(port, parameter)
@@ -164,6 +168,8 @@ class MavlinkServer:
         if message is None:
             return False
         port.send(message)
+        if ident == m.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN:
+            port.origin_told = self.vehicle.origin
         return True
 
     # -- handlers ------------------------------------------------------------------------------------------------
@@ -246,13 +252,12 @@ class MavlinkServer:
         else:
             port.timesync.update(now_s, message.ts1 * 1e-9, message.tc1 * 1e-9)
 
-    def _on_origin(self, port: Port, message: Message) -> None:
+    def _on_origin(self, _port: Port, message: Message) -> None:
         latitude, longitude = message.latitude * 1e-7, message.longitude * 1e-7
         if abs(latitude) > _MAX_LATITUDE_DEG or abs(longitude) > 180.0 or abs(message.altitude) > _MAX_ALTITUDE_MM:
             self.counters["origins_refused"] += 1
             return
         self.vehicle.origin = (latitude, longitude, message.altitude * 1e-3)
-        self._tell(port, m.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
 
     def _on_mission_list(self, port: Port, message: Message) -> None:
         port.send(

@@ -24,12 +24,13 @@ Builder = Callable[[Vehicle], Message]
 _LANDED = {
     Ground.LANDED: m.MAV_LANDED_STATE_ON_GROUND,
     Ground.SPOOLING: m.MAV_LANDED_STATE_ON_GROUND,
-    Ground.CLIMBING: m.MAV_LANDED_STATE_TAKEOFF,
+    Ground.CLIMBING: m.MAV_LANDED_STATE_IN_AIR,
     Ground.FLYING: m.MAV_LANDED_STATE_IN_AIR,
     Ground.LANDING: m.MAV_LANDED_STATE_LANDING,
 }
 _CELL_MV, _CELL_EMPTY_MV, _CELLS = 4150, 3500, 4
 _UPPER_TRIANGLE = 21
+_GRAVITY_M_S2 = 9.80665
 
 
 def _boot_ms(v: Vehicle) -> int:
@@ -129,11 +130,13 @@ def position_target_local_ned(v: Vehicle) -> Message:
 
 
 def extended_sys_state(v: Vehicle) -> Message:
-    """EXTENDED_SYS_STATE: on the ground, taking off, in the air, landing."""
+    """EXTENDED_SYS_STATE: on the ground, in the air; taking off and landing only in the modes of that name."""
     landed = _LANDED[v.land.state]
     going_down = v.commander.state in (NavState.LAND, NavState.DESCEND)
     if landed == m.MAV_LANDED_STATE_IN_AIR and going_down:
         landed = m.MAV_LANDED_STATE_LANDING
+    if landed == m.MAV_LANDED_STATE_IN_AIR and v.commander.state is NavState.TAKEOFF:
+        landed = m.MAV_LANDED_STATE_TAKEOFF
     return m.MAVLink_extended_sys_state_message(m.MAV_VTOL_STATE_UNDEFINED, landed)
 
 
@@ -166,8 +169,8 @@ def timesync(v: Vehicle) -> Message:
 
 
 def gps_global_origin(v: Vehicle) -> Message:
-    """GPS_GLOBAL_ORIGIN once somebody has set it."""
-    if v.origin is None:
+    """GPS_GLOBAL_ORIGIN once somebody has set it and the position is global by it."""
+    if v.origin is None or not (v.estimator.horizontal_valid and v.estimator.frame_is_ned):
         return None
     latitude, longitude, height = v.origin
     return m.MAVLink_gps_global_origin_message(
@@ -202,14 +205,20 @@ def home_position(v: Vehicle) -> Message:
 
 
 def hil_state_quaternion(v: Vehicle) -> Message:
-    """HIL_STATE_QUATERNION: the true pose, as SITL tells it; latitude and longitude resolve 1.1 cm."""
+    """HIL_STATE_QUATERNION: the true pose, as SITL tells it.
+
+    Latitude and longitude resolve 1.1 cm, speeds are whole cm/s cut off towards zero, accelerations whole m/s^2. It has
+    no stamp: PX4 leaves ``time_usec`` at 0.
+    """
     s = v.body.state
     latitude, longitude, height = to_global(TRUTH_ORIGIN, (float(s[0]), float(s[1]), float(s[2])))
-    speed = [round(100.0 * float(c)) for c in s[3:6]]
-    accel = [int(np.clip(c / 9.80665 * 1000.0, -32768, 32767)) for c in v.body.force]
+    speed = [int(100.0 * float(c)) for c in s[3:6]]
+    accel = [
+        int(np.clip(c, -32768, 32767)) for c in rotation_from_wxyz(s[6:10]) @ v.body.force + (0.0, 0.0, _GRAVITY_M_S2)
+    ]
     return m.MAVLink_hil_state_quaternion_message(
-        int(v.now_s * 1e6), [float(c) for c in s[6:10]], float(s[10]), float(s[11]), float(s[12]),
-        round(latitude * 1e7), round(longitude * 1e7), round(height * 1e3), *speed, 0, 0, *accel,
+        0, [float(c) for c in s[6:10]], float(s[10]), float(s[11]), float(s[12]),
+        int(latitude * 1e7), int(longitude * 1e7), int(height * 1e3), *speed, 0, 0, *accel,
     )  # fmt: skip
 
 
