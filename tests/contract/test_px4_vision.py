@@ -71,7 +71,7 @@ def test_origin_with_local_ned_makes_hold_available(frame: int, available: bool)
     c.vision.frame = frame
     c.set_origin()
     assert fused(c)
-    assert c.got["GPS_GLOBAL_ORIGIN"]
+    assert bool(c.got["GPS_GLOBAL_ORIGIN"]) is available
     c.hover()
     assert c.set_mode(NavState.HOLD) == [0, 0 if available else 1]
     c.run(1.1)

@@ -44,6 +44,8 @@ class World:
     armed: bool = False
     mode: str = "hold"
     engaged_id: int = 0
+    spent_id: int = 0
+    """The highest mission that was ever engaged; a bridge that was restarted does not know it, and engages none anew."""
     override: bool = False
     connected: bool = True
     vehicle_silent: bool = False
@@ -116,6 +118,11 @@ class World:
             if self.state in wanted:
                 break
         return self.state
+
+    def list_falls_silent(self, for_s: float) -> None:
+        """Let the last list of trees be so old; a new one comes with the next revision."""
+        if self._trees is not None:
+            self._trees = Seen(self._trees.message, self.now_ns - round(for_s * 1e9))
 
     def start(self) -> None:
         self.run(seconds=0.5)
@@ -196,8 +203,9 @@ class World:
         g = out.guidance
         if self.override or self.vehicle_silent:
             return
-        if g.engage and not self.armed and g.mission_id > self.engaged_id:
-            self.engaged_id, self.armed, self.mode = g.mission_id, True, "offboard"
+        if g.engage and not self.armed and g.mission_id > self.spent_id:
+            self.engaged_id = self.spent_id = g.mission_id
+            self.armed, self.mode = True, "offboard"
             self.armings += 1
         if self.armed and g.land and self.mode == "offboard":
             self.mode = "land"

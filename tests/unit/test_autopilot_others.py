@@ -115,7 +115,7 @@ def test_refused_arming_says_what_the_autopilot_answered() -> None:
 
 def test_the_origin_is_never_set_in_flight() -> None:
     rig = Rig()
-    assert any(m.get_type() == "SET_GPS_GLOBAL_ORIGIN" for m in rig.run(3.0))
+    assert any(m.get_type() == "SET_GPS_GLOBAL_ORIGIN" for m in rig.run(5.0))
     rig.armed = True
     rig.run(0.2)
     assert not any(m.get_type() == "SET_GPS_GLOBAL_ORIGIN" for m in rig.run(6.0))

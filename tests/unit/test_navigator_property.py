@@ -1,5 +1,8 @@
-"""Whatever happens, in whatever order: the limits hold, nothing moves while slam is lost, nobody arms without a
-command, and in the end the aircraft is on the ground or in the pilot's hands."""
+"""Whatever happens, in whatever order: the limits hold, nothing moves while slam is lost or silent, nobody arms without
+a command, and in the end the aircraft is on the ground or in the pilot's hands.
+
+There is a rule for each loss of docs/safety.md that the navigator answers for, and for its end.
+"""
 
 from __future__ import annotations
 
@@ -61,6 +64,7 @@ class Flights(RuleBasedStateMachine):
             layout, state = _AT_THE_FENCE, "dock"
         self.world = copy.deepcopy(_snapshot(layout, state))
         self.orders = int(state != "idle")
+        self._silent_s = 0.0
         if first == "slam lost":
             self.slam("lost")
         elif first == "target off":
@@ -69,6 +73,7 @@ class Flights(RuleBasedStateMachine):
 
     def _step(self, seconds: float) -> None:
         for _ in range(round(seconds / STEP_S)):
+            self._silent_s = self._silent_s + STEP_S if self.world.slam is None else 0.0
             self.world.step()
             self._check()
 
@@ -94,7 +99,7 @@ class Flights(RuleBasedStateMachine):
             away = np.array(s.position_m) - home
             assert np.hypot(away[0], away[1]) <= limits.fence_radius_m + 0.05
             assert -0.5 <= away[2] <= limits.fence_height_m + 0.05
-        lost = world.slam == "lost"
+        lost = world.slam == "lost" or self._silent_s > _SHORT.failsafe.pose_silent_s + 2.0 * STEP_S
         if lost:
             assert not velocity.any(), "moving while slam is lost"
             assert s.yaw_rate_rad_s == 0.0, "turning while slam is lost"
@@ -208,6 +213,41 @@ class Flights(RuleBasedStateMachine):
         self.world.position_m[2] = 0.0
         self._step(0.1)
 
+    @precondition(lambda self: self.world.armed)
+    @rule()
+    def disarmed_by_another(self) -> None:
+        self.world.armed, self.world.mode = False, "hold"
+        self.world.position_m[2] = 0.0
+        self._step(0.2)
+        assert self.world.outputs is not None
+        if not self.world.vehicle_silent:
+            assert not self.world.outputs.guidance.engage
+
+    @rule()
+    def bridge_restarts(self) -> None:
+        self.world.engaged_id = 0
+        self._step(0.2)
+
+    @rule(there=st.booleans(), seconds=st.sampled_from([0.2, 6.0]))
+    def ground_station(self, there: bool, seconds: float) -> None:
+        self.world.station = there
+        self._step(seconds)
+
+    @rule(old=st.booleans())
+    def list_of_trees(self, old: bool) -> None:
+        """The list falls silent, or comes anew."""
+        if old:
+            self.world.list_falls_silent(_SHORT.failsafe.trees_stale_s + 1.0)
+        else:
+            self.world.revision += 1
+        self._step(0.2)
+
+    @rule(eyes=st.booleans())
+    def guard(self, eyes: bool) -> None:
+        """The live guard sees nothing at all, or sees again."""
+        self.world.eyes = eyes
+        self._step(0.2)
+
     @rule()
     def navigator_restarts(self) -> None:
         self.world.mission = Mission(_FAST)
@@ -225,8 +265,7 @@ class Flights(RuleBasedStateMachine):
         world.vehicle_silent = False
         world.battery = 0.1  # the battery ends every flight
         for _ in range(round(60.0 / STEP_S)):
-            world.step()
-            self._check()
+            self._step(STEP_S)
             if not world.armed or world.override:
                 break
         assert not world.armed or world.override, f"still flying: {world.state}, {world.mission.reason}"
