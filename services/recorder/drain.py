@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 LOG = logging.getLogger(__name__)
 
 _MB = 1_000_000
+_NEW_FILE_BYTES = 4 * _MB
+"""Without so much room no file is begun: it would be refused at once, again and again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +132,7 @@ class Drain:
             return
         free = self._free_bytes()
         frames, anything = free >= self._limits.reserve_bytes, free >= self._limits.reserve_bytes // 4
-        if not anything:
+        if not anything or (self._file is None and free < _NEW_FILE_BYTES):
             self._tell(f"the disk is full ({free // _MB} MB left): nothing is recorded until there is room")
             self.counters["dropped_disk_full"] += len(taken)
             self._complete()
