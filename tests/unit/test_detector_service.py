@@ -113,7 +113,7 @@ def test_withdrawn_and_new_maps() -> None:
 def test_a_map_that_changes_all_the_time_gives_at_most_five_lists_a_second() -> None:
     system = _System()
     for tick in range(40):  # 20 changes a second for two seconds, each of them news: the trees move by 1 cm
-        system.mapper.publish(MAP_CLOUD, _submap(_forest() + [0.01 * tick, 0.0, 0.0], version=tick + 1))
+        system.mapper.publish(MAP_CLOUD, _submap(_forest() + np.array([0.01 * tick, 0.0, 0.0]), version=tick + 1))
         system.hub.run()
         system.hub.advance_to(system.hub.clock.now_ns() + 50_000_000)
     stamps = np.array([told.stamp_ns for told in system.lists]) * 1e-9
