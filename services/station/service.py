@@ -57,6 +57,7 @@ LOG = logging.getLogger(__name__)
 
 _REQUEST_RING = 512
 _TOKEN_RING = 1_024
+_TREES_RING = 8  # 1.6 s of an aircraft that tells five times a second
 _ORDERS_AT_ONCE = 8
 _NOT_ABOARD = frozenset({"router", "recorder"})
 _CLOUD_ASKS, _CLOUD_TIMEOUT_S, _CLOUD_AGAIN_S = 12, 5.0, 5.0
@@ -168,7 +169,8 @@ class Station:
         aircraft = self.brain.aircraft(uav)
         for topic, take in _TOPICS.items():
             bus.subscribe_keys(topic, functools.partial(self._on_message, aircraft, topic, take))
-        bus.subscribe(TREES_LIST, functools.partial(self._on_trees, aircraft))
+        # each list replaces the last, and decoding them is most of the work: on a busy machine old ones give way to the state
+        bus.subscribe(TREES_LIST, functools.partial(self._on_trees, aircraft), ring=_TREES_RING)
         bus.subscribe(PREVIEW_IMAGE, functools.partial(self._on_preview, aircraft))
         for early in sorted(pair for pair in self._waiting if pair[0] == uav):
             self._waiting.discard(early)
