@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 
 from services.evaluate.faults.bench_rig import Bench
+from services.evaluate.faults.flown import ENDED
 from services.evaluate.faults.missions import Back, Flights, Seen, line_of
 from services.evaluate.faults.model import Result, Row
 from services.evaluate.faults.verdict import common, faults_of, summary
@@ -21,6 +22,7 @@ _RESPONSE = {
     "recorder": "fly on", "preview": "fly on", "station": "fly on; hold when it is away for 5 s",
     "router": "hold while nobody hears anybody, or fly on; the others stay alive and join again",
 }  # fmt: skip
+_AFTER_DOCKING = frozenset({"docked", "undock", "return", "landing"})
 SIGNALS = {"kill -9": signal.SIGKILL, "SIGSTOP": signal.SIGSTOP}
 
 
@@ -64,14 +66,12 @@ def passing(bench: Bench, row: str, harm: Callable[[Flights], Back], lands: bool
     for _ in range(bench.moments):
         flights = bench.flights(row)
         flights.moment()
+        docks = flights.rig.flown.docks
         one = flights.see(row, partial(harm, flights))
         seen.append(one)
         failed += [f"{one.state}: {word}" for word in common(one)]
-        if (
-            one.end in {"landed", "released", "failed"}
-            and not lands
-            and one.state not in {"docked", "landing", "undock"}
-        ):
+        done = flights.rig.flown.docks > docks or one.state in _AFTER_DOCKING
+        if one.end in ENDED and not lands and not done:
             failed.append(f"{one.state}: the mission ended ({one.end}: {one.reason})")
     return result_of(seen, failed)
 
