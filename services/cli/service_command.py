@@ -58,13 +58,13 @@ def run_by_name(
     """
     from services.common.errors import InputError
     from services.common.process import BACKGROUND, give_way
-
-    if name in BACKGROUND:
-        give_way(BACKGROUND[name])  # before any other thread is made: they inherit it
     from services.common.runtime import run_service
     from services.common.stop import end_process
 
     tree = loaded(config, settings, port, more).config
+    gives_way = tree.camera.source != "sim" if tree.background_gives_way is None else tree.background_gives_way
+    if gives_way and name in BACKGROUND:
+        give_way(BACKGROUND[name])  # before any other thread is made: they inherit it
     if name == "router":
         from services.router.service import run
 

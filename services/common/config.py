@@ -36,6 +36,9 @@ class TreedockConfig(BaseModel):
     clock_ahead_s: float = 0.0
     """Added to this machine's clock: for tests of machines whose clocks differ."""
     log_level: Literal["debug", "info", "warning", "error"] = "info"
+    background_gives_way: bool | None = None
+    """Whether services that nobody flies by (mapper, detector, recorder, preview) run after the others where the processor is
+    short. None: where a camera or a recording feeds them; beside a simulator, which takes all that is left, they would starve."""
     router: RouterConfig = RouterConfig()
     security: SecurityConfig = SecurityConfig()
     supervisor: SupervisorConfig = SupervisorConfig()

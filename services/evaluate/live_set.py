@@ -46,6 +46,7 @@ def live_config(folder: Path) -> TreedockConfig:
 
     base = TreedockConfig()
     tree = with_port(base.model_copy(update={
+        "background_gives_way": True,
         "camera": base.camera.model_copy(update={"source": "sim"}),
         "autopilot": base.autopilot.model_copy(update={"connection": f"udpin:127.0.0.1:{free_port()}"}),
     }), fixed=False)  # fmt: skip

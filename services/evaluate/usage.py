@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import psutil
 
@@ -68,3 +69,11 @@ def over_budget(used: Mapping[str, Usage], budgets: Mapping[str, Budget]) -> lis
         if usage.pss_mb > TOLERANCE * budget.pss_mb:
             found.append(f"{name} takes {usage.pss_mb:.0f} MB of {budget.pss_mb:.0f}")
     return found
+
+
+def group_priority() -> int:
+    """Return the niceness of this session's processes against all others (man sched, autogroups); 0 where there is none."""
+    try:
+        return int(Path("/proc/self/autogroup").read_text(encoding="ascii").split()[-1])
+    except (OSError, ValueError, IndexError):
+        return 0

@@ -25,7 +25,7 @@ Job = Callable[[], None]
 _SWITCH_S = 0.0005
 """How long a thread may keep Python to itself: the default of 5 ms would be added to a frame's time."""
 _CLOSE_S = 0.3
-_NICE = 5
+_NICE = 10
 """Where cores are few tracking runs first (Linux: per thread)."""
 
 
