@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.common.errors import InputError
+from services.detector.las_header import announced_too_much
 from services.detector.model import Views
 from services.detector.readers_pcd import read_pcd
 from services.detector.readers_ply import read_ply
@@ -64,6 +65,8 @@ def read_cloud(path: Path) -> Cloud:
 def _read_las(path: Path) -> Floats:
     import laspy
 
+    if too_much := announced_too_much(path):
+        raise InputError(f"{path}: not a whole LAS/LAZ file: its header announces {too_much}")
     try:
         las = laspy.read(path)
         expected = int(las.header.point_count)

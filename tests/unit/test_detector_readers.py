@@ -13,6 +13,7 @@ from services.common.geometry import level_camera
 from services.detector.readers import read_cloud
 from services.detector.readers_pcd import lzf_decompress
 from services.evaluate.exports import Viewpoints, ply_bytes
+from tests.fuzz.seeds import las
 
 POINTS = np.round(np.random.default_rng(1).normal(0.0, 3.0, (200, 3)), 3).astype(np.float32)
 
@@ -162,3 +163,15 @@ def test_our_own_ply_tells_from_where_it_was_seen(tmp_path: Path) -> None:
     assert views.rotations == pytest.approx(poses[:, :3, :3], abs=1e-6)
     (tmp_path / "odd.ply").write_bytes(data.replace(b"element viewpoint 2", b"element viewpoint 1"))
     assert read_cloud(tmp_path / "odd.ply").views is None
+
+
+@pytest.mark.parametrize(("at", "form", "words"), [(100, "<I", "records"), (107, "<I", "points")])
+def test_a_header_that_announces_more_than_the_file_holds_is_refused_at_once(
+    tmp_path: Path, at: int, form: str, words: str
+) -> None:
+    """Found by fuzzing: four thousand million records kept laspy reading, and took 2.5 GB in a minute."""
+    data = bytearray(las(compressed=False))
+    data[at : at + 4] = struct.pack(form, 0xFFFF_FFF0)
+    (tmp_path / "a.las").write_bytes(data)
+    with pytest.raises(InputError, match=f"announces .* {words}"):
+        read_cloud(tmp_path / "a.las")
