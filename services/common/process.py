@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 _PR_SET_PDEATHSIG = 1
-BACKGROUND: Mapping[str, int] = {"mapper": 15, "detector": 15, "recorder": 10, "preview": 15}
+BACKGROUND: Mapping[str, int] = {"mapper": 10, "detector": 10, "recorder": 10, "preview": 10}
 """Niceness of services that may be late: nobody flies by them within a frame. Under systemd CPUWeight does the same."""
 _STARTING_OBJECTS = 50_000
 """New objects between two looks of the garbage collector while libraries load: the usual 700 cost a fifth of the start."""
