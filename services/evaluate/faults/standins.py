@@ -30,10 +30,11 @@ from schemas.topics import (
     TREES_TARGET,
 )
 from schemas.trees import Target, TreeList
+from services.cli.service_command import end_with
 from services.common.config import load_config
 from services.common.context import Context
 from services.common.geometry import from_transform
-from services.common.process import die_with_parent, prepare_process
+from services.common.process import prepare_process
 from services.common.runtime import run_service
 from services.common.stop import end_process
 from services.evaluate.synthetic import ChainErrors, SyntheticChain, TrueTrunk
@@ -162,5 +163,5 @@ def main(arguments: list[str]) -> int:
 
 if __name__ == "__main__":
     prepare_process()
-    die_with_parent()
+    end_with(int(sys.argv[sys.argv.index("--parent") + 1]))
     end_process(main(sys.argv[1:]))
