@@ -21,7 +21,7 @@ def view(
     settings: Settings = None,
     port: Port = None,
 ) -> int:
-    """Show camera, path, cloud, trees and events in rerun (an extra: pip install 'treedock[view]')."""
+    """Show camera, path, cloud, trees and events in rerun (needs the extra named view)."""
     from services.view.rerun_scene import Scene, load_rerun
 
     rerun = load_rerun()
