@@ -9,9 +9,8 @@ from services.evaluate.flight import Flight, random_case
 from services.simulator.px4.flight import Sticks
 from services.simulator.px4.modes import NavState
 
-# take_off: not in the tenth of a second before our own request for offboard, where the pilot's switch is not told yet
 _MOMENTS = (
-    ("take_off", 1.2), ("scan", 4.0), ("select", 0.5), ("face", 0.5), ("approach", 2.0), ("dock", 1.0),
+    ("take_off", 1.5), ("scan", 4.0), ("select", 0.5), ("face", 0.5), ("approach", 2.0), ("dock", 1.0),
     ("docked", 1.0), ("landing", 1.0),
 )  # fmt: skip
 

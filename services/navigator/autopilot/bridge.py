@@ -148,7 +148,7 @@ class Bridge:
         t = self.telemetry
         heard = t.age_s(now_ns) <= self.config.link_lost_s
         return Vehicle(heard, t.armed, t.mode, t.landed == "on_ground", t.fused(now_ns), self.refusal(),
-                       self.foreign.word(now_ns), t.arming_word, t.failsafe)  # fmt: skip
+                       self.foreign.word(now_ns), t.arming_word, t.failsafe, t.mode_ns)  # fmt: skip
 
     def refusal(self) -> str:
         """Return why the vehicle must not be flown, in words; empty when nothing speaks against it."""

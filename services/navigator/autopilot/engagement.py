@@ -39,6 +39,8 @@ class Vehicle:
     """What the autopilot answered when it was asked to arm, in words."""
     failsafe: bool = False
     """The autopilot says of itself that it acts by a failsafe."""
+    mode_ns: int = 0
+    """When it last told its mode."""
 
 
 class Engagement:
@@ -59,6 +61,9 @@ class Engagement:
         self._in_offboard = False
         self._foreign = ""
         self._land_seen = False
+        self._mode_ns = 0
+        self._just_told = False
+        """The mode is of this very moment: a pilot's switch that we do not know of would be overridden by what we ask."""
         self._mode_before = ""
         """The mode in which the vehicle stood when we began: the pilot changes it to say no."""
 
@@ -102,6 +107,7 @@ class Engagement:
     def update(self, vehicle: Vehicle, now_ns: int) -> list[Order]:
         """Advance, and return the orders to send to the autopilot now."""
         self._in_offboard = vehicle.mode == OFFBOARD
+        self._just_told, self._mode_ns = vehicle.mode_ns != self._mode_ns, vehicle.mode_ns
         if self.phase in ("quiet", "released"):
             return []
         if not vehicle.heard:
@@ -140,7 +146,7 @@ class Engagement:
             return self._ask("arm", now_ns)
         if self._elapsed_s(now_ns) > self.config.engage_timeout_s:
             return self._cancel(f"the autopilot stays in {vehicle.mode}", now_ns)
-        return self._ask("offboard", now_ns)
+        return self._ask("offboard", now_ns) if self._just_told else []
 
     def _arm(self, vehicle: Vehicle, now_ns: int) -> list[Order]:
         if vehicle.mode != OFFBOARD:
@@ -152,7 +158,7 @@ class Engagement:
             return self._cancel("the navigator took its order back", now_ns)
         if self._elapsed_s(now_ns) > self.config.engage_timeout_s:
             return self._cancel(f"the autopilot refuses to arm{vehicle.arming and ': '}{vehicle.arming}", now_ns)
-        return self._ask("arm", now_ns)
+        return self._ask("arm", now_ns) if self._just_told else []
 
     def _fly(self, vehicle: Vehicle, now_ns: int) -> list[Order]:
         if vehicle.mode != OFFBOARD:

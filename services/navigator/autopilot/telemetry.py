@@ -41,6 +41,8 @@ class Telemetry:
         self.heard_ns: int | None = None
         self.armed = False
         self.mode = "unknown"
+        self.mode_ns = 0
+        """When the mode was last told."""
         self.landed: LandedState = "unknown"
         self.battery_share: float | None = None
         self.R_map_body: Matrix | None = None
@@ -72,7 +74,7 @@ class Telemetry:
                 return False
             self.system = system
             self.armed = bool(message.base_mode & mav.MAV_MODE_FLAG_SAFETY_ARMED)
-            self.mode = mode_name(message.custom_mode)
+            self.mode, self.mode_ns = mode_name(message.custom_mode), received_ns
             self.failsafe = message.system_status in (mav.MAV_STATE_CRITICAL, mav.MAV_STATE_EMERGENCY)
         if self.system is None or system != self.system:
             return False
@@ -140,8 +142,8 @@ class Telemetry:
             link_age_s=min(max(age, 0.0), 1e6), note=note[:500],
         )  # fmt: skip
 
-    def _on_current_mode(self, message: Any, _: int) -> None:  # noqa: ANN401
-        self.mode = mode_name(message.custom_mode)
+    def _on_current_mode(self, message: Any, received_ns: int) -> None:  # noqa: ANN401
+        self.mode, self.mode_ns = mode_name(message.custom_mode), received_ns
 
     def _on_attitude_quaternion(self, message: Any, _: int) -> None:  # noqa: ANN401
         q = (message.q1, message.q2, message.q3, message.q4)
