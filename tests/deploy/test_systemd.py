@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import sys
 from collections.abc import Iterator
@@ -40,10 +41,11 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
     folder.mkdir(parents=True)
     for name, text in units.files(str(ROOT / ".venv")).items():
         (folder / name).write_text(text)
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     for unit in units.UNITS:
         extra = folder / f"treedock-{unit.name}.service.d/here.conf"
         extra.parent.mkdir()
-        extra.write_text(_HERE.format(cache=Path.home() / ".cache/treedock/numba", root=ROOT))
+        extra.write_text(_HERE.format(cache=cache / "treedock/numba", root=ROOT))
     config = machine.add / "etc/treedock/10-treedock.toml"
     config.parent.mkdir(parents=True, exist_ok=True)
     config.write_text('config_version = 1\nuav = "kea"\n')
