@@ -7,30 +7,27 @@ a PNG by its chunks and checksums, a JPEG by walking its data (``jpeg.py``).
 from __future__ import annotations
 
 import dataclasses
-import struct
-import zlib
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.camera import ColourEncoding, DepthEncoding, RgbdFrame
+from services.camera.depth_codec import (
+    JPEG_START,
+    PNG_MAGIC,
+    Bytes,
+    check_png,
+    decode_image,
+)
+from services.camera.depth_codec import FrameError as FrameError
+from services.camera.depth_codec import decode_depth as decode_depth
+from services.camera.depth_codec import decode_depth_image as decode_depth_image
 from services.camera.jpeg import jpeg_fault
 
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-Bytes = bytes | bytearray | memoryview
-
-_PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
-_JPEG_START, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
+_JPEG_END = b"\xff\xd9"
 _PNG_LEVEL = 1
 """zlib level of our depth images: level 1 costs a third of the default's time for a tenth more bytes."""
 _ZSTD_LEVEL = 1
-
-
-class FrameError(ValueError):
-    """An image that cannot be used; the text is one line that says what is wrong with it."""
 
 
 def check_container(data: Bytes) -> None:
@@ -40,47 +37,13 @@ def check_container(data: Bytes) -> None:
         FrameError: neither PNG nor JPEG, cut short, or damaged inside.
     """
     view = memoryview(data)
-    if len(view) == 0:
-        raise FrameError("the image is empty (0 bytes)")
-    if view[:8] == _PNG_MAGIC:
-        for kind in _png_chunks(view):
-            if kind == b"IEND":
-                return
-        raise FrameError(f"truncated PNG: no IEND chunk in {len(view)} bytes")
-    if view[:3] == _JPEG_START:
+    if view[:3] == JPEG_START:
         if not bytes(view[-64:]).rstrip(b"\0").endswith(_JPEG_END):
             raise FrameError(f"truncated JPEG: no end marker in {len(view)} bytes")
         if fault := jpeg_fault(view):
             raise FrameError(fault)
         return
-    raise FrameError(f"neither PNG nor JPEG: it begins with {bytes(view[:4]).hex()}")
-
-
-def _png_chunks(view: memoryview) -> Iterator[bytes]:
-    cursor = len(_PNG_MAGIC)
-    while cursor + 12 <= len(view):
-        (length,) = struct.unpack(">I", view[cursor : cursor + 4])
-        end = cursor + 12 + length
-        if end > len(view):
-            raise FrameError(f"truncated PNG: a chunk of {length} bytes ends beyond the file's {len(view)} bytes")
-        (crc,) = struct.unpack(">I", view[end - 4 : end])
-        if zlib.crc32(view[cursor + 4 : end - 4]) != crc:
-            raise FrameError("damaged PNG: a chunk fails its checksum")
-        yield bytes(view[cursor + 4 : cursor + 8])
-        cursor = end
-
-
-def _decode_image(data: Bytes, flag_name: str) -> NDArray[np.generic]:
-    import cv2
-
-    check_container(data)
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), getattr(cv2, flag_name))
-    except cv2.error as error:
-        raise FrameError(f"the image cannot be decoded: {error.err or 'OpenCV refused it'}") from None
-    if image is None:
-        raise FrameError("the image cannot be decoded: its data is damaged")
-    return np.asarray(image)
+    check_png(view)
 
 
 def decode_colour_image(data: Bytes, width: int, height: int) -> NDArray[np.uint8]:
@@ -89,11 +52,12 @@ def decode_colour_image(data: Bytes, width: int, height: int) -> NDArray[np.uint
     Raises:
         FrameError: damaged, or of another size.
     """
-    if memoryview(data)[:8] == _PNG_MAGIC and _png_bits(data) == 16:
+    if memoryview(data)[:8] == PNG_MAGIC and _png_bits(data) == 16:
         raise FrameError(
             "colour image has 16 bits a pixel, expected 8: is it the depth image (colour and depth swapped)?"
         )
-    image = _decode_image(data, "IMREAD_COLOR")
+    check_container(data)
+    image = decode_image(data, "IMREAD_COLOR")
     if image.shape != (height, width, 3) or image.dtype != np.uint8:
         raise FrameError(f"colour image is {image.shape[1]}x{image.shape[0]}, expected {width}x{height}")
     return image.astype(np.uint8, copy=False)
@@ -102,45 +66,6 @@ def decode_colour_image(data: Bytes, width: int, height: int) -> NDArray[np.uint
 def _png_bits(data: Bytes) -> int:
     """Return the bits a sample of a PNG has (its IHDR chunk comes first), 0 when it is cut before that."""
     return data[24] if len(data) > 24 else 0
-
-
-def decode_depth_image(data: Bytes, width: int, height: int) -> NDArray[np.uint16]:
-    """Return the 16 bit PNG as (height, width) uint16, raw units.
-
-    Raises:
-        FrameError: damaged, of another size, or not one 16 bit channel.
-    """
-    image = _decode_image(data, "IMREAD_UNCHANGED")
-    if image.shape[:2] != (height, width):
-        raise FrameError(f"depth image is {image.shape[1]}x{image.shape[0]}, expected {width}x{height}")
-    if image.ndim != 2 or image.dtype != np.uint16:
-        channels = 1 if image.ndim == 2 else image.shape[2]
-        swapped = ": is it the colour image (colour and depth swapped)?" if channels >= 3 else ""
-        raise FrameError(f"depth image has {channels} channel(s) of {image.dtype}, expected one of uint16{swapped}")
-    return image.astype(np.uint16, copy=False)
-
-
-def decode_depth(data: Bytes, encoding: DepthEncoding, width: int, height: int) -> NDArray[np.uint16]:
-    """Return depth bytes in any wire encoding as (height, width) uint16 raw units; ``z16`` is a view.
-
-    Raises:
-        FrameError: the bytes are not such an image.
-    """
-    if encoding == "png":
-        return decode_depth_image(data, width, height)
-    raw = _unzstd(data, 2 * width * height) if encoding == "zstd" else data
-    if len(raw) != 2 * width * height:
-        raise FrameError(f"depth has {len(raw)} bytes, {2 * width * height} expected for {width}x{height}")
-    return np.frombuffer(raw, "<u2").reshape(height, width)
-
-
-def _unzstd(data: Bytes, size: int) -> bytes:
-    import zstandard
-
-    try:
-        return zstandard.ZstdDecompressor().decompress(bytes(data), max_output_size=size)
-    except zstandard.ZstdError as error:
-        raise FrameError(f"depth is not {size} bytes of zstd: {str(error)[:120]}") from None
 
 
 def decode_depth_raw(frame: RgbdFrame) -> NDArray[np.uint16]:

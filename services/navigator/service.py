@@ -27,7 +27,7 @@ from schemas.topics import (
 )
 from schemas.trees import Target, TreeList
 from schemas.vehicle import VehicleState
-from services.camera.codecs import FrameError, decode_depth
+from services.camera.depth_codec import FrameError, decode_depth
 from services.common.context import Context
 from services.doctor.model import ServiceFact
 from services.navigator.commands import CommandDesk

@@ -13,7 +13,7 @@ from schemas.navigation import MissionState
 from schemas.slam import Pose
 from schemas.topics import CAMERA_COMPRESSED, CAMERA_RGBD, MISSION_STATE, SLAM_POSE, TREES_LIST, TREES_TARGET
 from schemas.trees import Target, Tree, TreeList
-from services.camera.codecs import FrameError, decode_depth
+from services.camera.depth_codec import FrameError, decode_depth
 from services.common.context import Context
 from services.common.geometry import Matrix, from_transform
 from services.detector.refine.agreement import Colour
