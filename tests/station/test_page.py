@@ -146,13 +146,14 @@ def test_two_operators_one_in_command(ground: Ground, page: Page, browser: Brows
 
 
 def test_several_aircraft_side_by_side(ground: Ground, page: Page) -> None:
-    for number in (1, 2):
+    for number in (2, 1):  # by name on the page, whoever is heard first
         ground.aircraft(f"uav{number}", seed=number)
-    true(page, "window.treedock.crafts.size === 2", 60.0)
+        true(page, f"window.treedock.crafts.size === {3 - number}", 60.0)
+    true(page, "document.querySelectorAll('.chip').length === 3", 10.0)
     page.click(".chip >> nth=0")
-    assert page.locator(".tile").count() == 2
+    true(page, "document.querySelectorAll('.tile').length === 2", 10.0)
     page.click(".tile >> nth=1")
-    assert page.inner_text("#who-uav") == "uav2"
+    true(page, "document.getElementById('who-uav').innerText === 'uav2'", 10.0)
     page.wait_for_selector("#order-start:not([aria-disabled])", timeout=45_000)
     held(page, "#order-start")
     true(page, "window.treedock.craft?.view?.mission?.state !== 'idle'", 5.0)

@@ -4,8 +4,13 @@ import { $, duration, el, keyed, set, text, words } from "./dom.js";
 import { TITLES } from "./cards.js";
 import { MapView } from "./map.js";
 
+/** By name, whoever was heard first: an operator finds each aircraft in its place again. */
+function inOrder(page) {
+  return [...page.crafts.values()].sort((a, b) => a.uav.localeCompare(b.uav, "en", { numeric: true }));
+}
+
 export function drawFleet(page, now) {
-  const items = [...page.crafts.values()].map((craft) => ({ key: craft.uav, craft }));
+  const items = inOrder(page).map((craft) => ({ key: craft.uav, craft }));
   if (items.length > 1) items.unshift({ key: "*", craft: null });
   keyed($("fleet"), items, (i) => i.key, (i) => {
     const node = el("button", { class: "chip" }, el("i", { class: "dot" }), el("div", {}, el("b"), el("small")));
@@ -26,7 +31,7 @@ export function drawFleet(page, now) {
 }
 
 export function drawTiles(page, now) {
-  keyed($("grid"), [...page.crafts.values()], (c) => c.uav, (c) => {
+  keyed($("grid"), inOrder(page), (c) => c.uav, (c) => {
     const canvas = el("canvas"), node = el("button", { class: "tile" }, el("header", {}, el("i", { class: "dot" }), el("b"), el("span"), el("small")), canvas);
     const map = new MapView(canvas, { bare: true });
     map.show(c);
