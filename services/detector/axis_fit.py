@@ -208,7 +208,7 @@ def _move_offsets(A: Floats, y: Floats, offset: Floats, views: int, held: float,
 
 
 @njit(cache=True, nogil=True)
-def _fit(
+def fit_views(
     P: Floats, U: Floats, G: Floats, W: Ints32, offset: Floats, views: int, held: float, weight: float, x: Floats,
     k_range: float, surface: float, start: float, prior: Floats, normal: Floats, turns: int,
 ) -> float:  # fmt: skip
@@ -279,7 +279,7 @@ def fit_axis(
         views = _number_views(W, m, number_of, views)
         x[:4] = 0.0
         weight = every / correlated
-        scale = _fit(
+        scale = fit_views(
             P[:m], U[:m], G[:m], W, offset, views, held, weight, x, k_range, surface, scale, prior, normal, _TURNS[turn]
         )  # fmt: skip
         if scale < 0.0 or not 0.01 <= x[4] <= 1.5:

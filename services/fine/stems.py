@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.trees import Tree
-from services.detector.axis_fit import _fit as fit_views
-from services.detector.axis_fit import fit_axis, to_upright
+from services.detector.axis_fit import fit_axis, fit_views, to_upright
 from services.fine.config import FineConfig
 from services.fine.model import BREAST_HEIGHT_M, Floats, Section, Stem, StemPoints
 from services.fine.stem_kernels import arc_of, fit_section, section_frame
