@@ -172,11 +172,15 @@ def test_the_hub_stops_services_once_and_knows_its_listeners() -> None:
 def test_a_sandbox_that_forbids_priorities_stops_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
     """systemd's filter of resource calls answers EPERM: the mapping thread of slam ended at its first line."""
 
+    asked: list[int] = []
+
     def forbidden(*_: int) -> None:
+        asked.append(1)
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr("os.setpriority", forbidden)
     give_way(5)
+    assert asked == [1], "it was refused, once, and went on"
 
 
 def test_somebody_without_a_home_has_kernels_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

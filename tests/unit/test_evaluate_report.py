@@ -61,7 +61,9 @@ def test_left_is_left_and_ahead_is_up() -> None:
 
 
 def test_no_points_is_a_picture_too() -> None:
-    ET.fromstring(cross_section_svg(TREE, np.empty((0, 3), np.float32)))
+    svg = cross_section_svg(TREE, np.empty((0, 3), np.float32))
+    assert ET.fromstring(svg).tag.endswith("svg")
+    assert len(numbers(svg, "circle", "cx", "cy", "r")) == 1, "the fit alone, no points"
 
 
 def target(number: int, tree_id: int = 7, **more: object) -> Target:
