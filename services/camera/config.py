@@ -68,7 +68,10 @@ class CameraConfig(BaseModel):
     restamp: bool = True
     """A live replay moves the recording's stamps to the present, so that the age of a message means something."""
     jpeg_quality: int = Field(default=90, ge=10, le=100)
-    compressed_depth: Literal["png", "zstd"] = "png"
+    """Colour of compressed frames, on the network and in recordings."""
+    compressed_depth: Literal["png", "zstd"] = "zstd"
+    """Depth of compressed frames, lossless. PNG takes six to fifteen times the processor time and is no smaller
+    (fr1_desk: 9.4 ms and 113 KB against 1.7 ms and 94 KB)."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

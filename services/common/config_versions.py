@@ -34,7 +34,24 @@ def _from_0(body: Body) -> Body:
 
 _RETIRED_0 = ("slam.accel_window_s", "slam.keyframe_interval_max")
 
-MIGRATIONS: Mapping[int, Migration] = {0: Migration(_RETIRED_0, _from_0)}
+_MOVED_1 = {"depth": "compressed_depth", "jpeg_quality": "jpeg_quality"}
+_RETIRED_1 = tuple(f"recorder.{name}" for name in _MOVED_1)
+
+
+def _from_1(body: Body) -> Body:
+    """Give the camera how frames are compressed: it compresses them, the recorder only writes them down."""
+    recorder, camera = body.get("recorder"), body.get("camera", {})
+    if not isinstance(recorder, Mapping) or not isinstance(camera, Mapping):
+        return body
+    moved = {new: recorder[old] for old, new in _MOVED_1.items() if old in recorder}
+    moved = {
+        name: value for name, value in moved.items() if value != "z16"
+    }  # uncompressed: the camera's frames = "raw"
+    rest = {name: value for name, value in recorder.items() if name not in _MOVED_1}
+    return {**body, "recorder": rest, **({"camera": {**moved, **camera}} if moved or camera else {})}
+
+
+MIGRATIONS: Mapping[int, Migration] = {0: Migration(_RETIRED_0, _from_0), 1: Migration(_RETIRED_1, _from_1)}
 """By version of the file. Files of version 0 carry no number; ``treedock config --migrate`` writes old files anew."""
 
 NEWEST = max(MIGRATIONS) + 1

@@ -7,8 +7,6 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from schemas.camera import DepthEncoding
-
 
 class RecorderConfig(BaseModel):
     """Settings of the recorder."""
@@ -20,10 +18,8 @@ class RecorderConfig(BaseModel):
     mcap: bool = True
     """False: nothing is recorded, only the missions' reports are written."""
     frames: Literal["compressed", "raw", "off"] = "compressed"
-    """Camera frames: colour as JPEG and depth lossless, as the sensor gave them (23 MB/s at 15 Hz), or none."""
-    depth: DepthEncoding = "zstd"
-    """Depth of compressed frames; every encoding is lossless."""
-    jpeg_quality: int = Field(default=90, ge=1, le=100)
+    """Camera frames: colour as JPEG and depth lossless (``camera.jpeg_quality`` and ``camera.compressed_depth`` say how),
+    as the sensor gave them (23 MB/s at 15 Hz), or none."""
     foxglove: bool = True
     """Also write image, cloud, pose and scene under Foxglove's schemas, so that Foxglove shows the file as it is."""
     foxglove_image_hz: float = Field(default=5.0, gt=0.0, le=60.0)

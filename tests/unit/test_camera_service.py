@@ -77,7 +77,7 @@ def test_compressed_frames_are_sent_only_while_somebody_listens() -> None:
     rig = Rig(CameraConfig(min_range_m=0.0, max_range_m=13.0, depth=RANGE_ONLY), listened=True)
     rig.simulate(frame(2))
     (packed,) = rig.packed
-    assert (packed.colour_encoding, packed.depth_encoding) == ("jpeg", "png")
+    assert (packed.colour_encoding, packed.depth_encoding) == ("jpeg", "zstd")
     assert np.array_equal(decode_depth_raw(packed), depth_image(2))
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from services.cli.app import invoke
 from services.common.config import TreedockConfig
 from services.common.config_loader import known_keys, load, to_toml
-from services.common.config_versions import Migration, current, migrate_file
+from services.common.config_versions import NEWEST, Migration, current, migrate_file
 from services.common.errors import InputError
 
 
@@ -159,7 +159,7 @@ def test_old_files_are_read_through_every_step() -> None:
 
 
 def test_this_version_is_read(tmp_path: Path) -> None:
-    path = write(tmp_path, "a.toml", 'config_version = 1\nuav = "kea"\n')
+    path = write(tmp_path, "a.toml", f'config_version = {NEWEST}\nuav = "kea"\n')
     assert load(path, environ={}, system_directory=tmp_path / "none").config.uav == "kea"
 
 
@@ -177,6 +177,15 @@ def test_a_file_that_says_it_is_new_may_not_hold_old_keys(tmp_path: Path) -> Non
         load(write(tmp_path, "a.toml", "config_version = 1\n" + OLD), environ={}, system_directory=tmp_path / "none")
 
 
+@pytest.mark.parametrize("head", ["", "config_version = 1\n"])
+@pytest.mark.parametrize(("depth", "wanted"), [("png", "png"), ("z16", "zstd")])
+def test_how_frames_are_compressed_moved_to_the_camera(tmp_path: Path, head: str, depth: str, wanted: str) -> None:
+    text = head + f'[recorder]\ndepth = "{depth}"\njpeg_quality = 70\nfile_mb = 9\n[camera]\nrate = 2.0\n'
+    found = load(write(tmp_path, "a.toml", text), environ={}, system_directory=tmp_path / "none").config
+    assert (found.camera.compressed_depth, found.camera.jpeg_quality, found.camera.rate) == (wanted, 70, 2.0)
+    assert found.recorder.file_mb == 9
+
+
 def test_migration_writes_the_file_anew_and_keeps_the_old_one(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -184,8 +193,8 @@ def test_migration_writes_the_file_anew_and_keeps_the_old_one(
     path.chmod(0o640)
     before = load(path, environ={}, system_directory=tmp_path / "none").config
     assert invoke(["config", "--migrate", "--config", str(path)]) == 0
-    assert "version 1" in capsys.readouterr().out
-    assert tomllib.loads(path.read_text())["config_version"] == 1
+    assert f"version {NEWEST}" in capsys.readouterr().out
+    assert tomllib.loads(path.read_text())["config_version"] == NEWEST
     assert path.stat().st_mode & 0o777 == 0o640
     assert (tmp_path / "a.toml.old").read_text() == OLD
     assert load(path, environ={}, system_directory=tmp_path / "none").config == before
