@@ -13,6 +13,7 @@ from schemas.camera import RgbdFrame
 from schemas.codec import Wire
 from schemas.command import Command, NonceRequest
 from schemas.envelope import Message
+from schemas.fleet import ClaimRequest, HeldState
 from schemas.health import Health
 from schemas.mapping import GroundPatch, MapIndex, Submap
 from schemas.navigation import Guidance, MissionState
@@ -128,6 +129,10 @@ COMMAND = Topic("cmd/*", Command, "station", ("navigator",), 0, None, _R, _QUERY
                 description="start hold resume abort land choose next: the reply says accepted or why not")  # fmt: skip
 COMMAND_NONCE = Topic("nonce", NonceRequest, "station", ("navigator",), 0, None, _R, _QUERY, "real_time", express=True,
                       recorded=False, description="ask the aircraft for a nonce to command with")  # fmt: skip
+FLEET_CLAIM = Topic("fleet/claim", ClaimRequest, "navigator", ("station",), 0, None, _R, _QUERY, "real_time", express=True, recorded=False,
+                    description="claim, renew, release a tree among several aircraft, tell that it is done: the reply grants a duration or says why not")  # fmt: skip
+FLEET_HELD = Topic("fleet/held", HeldState, "navigator", ("station",), 1, 3.0, _R, _STREAM, "data_high",
+                   description="what the aircraft believes to hold, and for how long; only where claims are switched on")  # fmt: skip
 CLOCK = Topic("clock", ClockRequest, ANY, ("router",), 0, None, _R, _QUERY, "real_time", express=True, recorded=False,
               description="ask the router for the time: all machines' clocks are brought to its own")  # fmt: skip
 PREVIEW_IMAGE = Topic("preview/image", PreviewImage, "preview", ("station",), 5, None, _R, _LATEST, "background",
@@ -143,7 +148,7 @@ SIM_TRUTH = Topic("sim/truth", SimTruth, "simulator", ("evaluate",), 15, None, _
 
 TOPICS: tuple[Topic, ...] = (
     CAMERA_RGBD, CAMERA_COMPRESSED, SLAM_POSE, SLAM_KEYFRAME, SLAM_GRAPH, MAP_CLOUD, MAP_SKETCH, MAP_INDEX, MAP_GROUND, TREES_LIST, TREES_TARGET,
-    MISSION_STATE, MISSION_GUIDANCE, VEHICLE_STATE, COMMAND, COMMAND_NONCE, CLOCK, PREVIEW_IMAGE, HEALTH, SIM_RGBD, SIM_CLOCK, SIM_TRUTH,
+    MISSION_STATE, MISSION_GUIDANCE, VEHICLE_STATE, COMMAND, COMMAND_NONCE, FLEET_CLAIM, FLEET_HELD, CLOCK, PREVIEW_IMAGE, HEALTH, SIM_RGBD, SIM_CLOCK, SIM_TRUTH,
 )  # fmt: skip
 
 LIVE = "live/*"

@@ -9,6 +9,7 @@ import numpy as np
 from schemas.camera import Intrinsics, RgbdFrame
 from schemas.codec import Wire
 from schemas.command import Command, CommandReply, NonceReply, NonceRequest
+from schemas.fleet import ClaimGoal, ClaimReply, ClaimRequest, HeldState
 from schemas.health import Health
 from schemas.mapping import GroundCell, GroundPatch, MapIndex, Submap
 from schemas.navigation import Guidance, MissionState, Setpoint
@@ -27,6 +28,9 @@ TREE = Tree(
     id=7, x_m=2.5, y_m=-1.0, z_m=-0.1, axis=(0.0, 0.0, 1.0), radius_m=0.12, radius_height_m=1.3, height_seen_m=1.9,
     sigma_xy_m=0.01, sigma_radius_m=0.004, arc_rad=2.1, confidence=0.9, observations=12, suitable=True,
 )  # fmt: skip
+GOAL = ClaimGoal(
+    kind="tree", map_id="map-1", from_m=(0.0, 0.5), to_m=(2.5, -1.0), radius_m=0.12, sigma_m=0.01, tree_id=7
+)
 TARGET = Target(
     stamp_ns=66_000_000, seq=1, map_id="map-1", status="tracking", tree_id=7, measured=True, bearing_rad=0.05,
     range_m=1.2, radius_m=0.12, image_x_px=310.0, sigma_bearing_rad=0.002, sigma_range_m=0.01, sigma_radius_m=0.004,
@@ -109,6 +113,10 @@ def all_messages() -> dict[str, Wire]:
         NonceReply(nonce=bytes(range(16)), valid_s=30.0, next_sequence=1),
         Command(name="choose", sender="station", nonce=bytes(range(16)), sequence=1, tree_id=7),
         CommandReply(accepted=False, reason="no tree 7 in the list", state="idle"),
+        ClaimRequest(kind="claim", lease_id=12, goal=GOAL, again=True),
+        ClaimReply(arbiter="arbiter-1", lease_id=12, granted=False, lease_s=0.0, reason="uav2 holds this tree", final=False),
+        HeldState(stamp_ns=66_000_000, seq=1, map_id="map-1", held=GOAL, left_s=21.5, asked=None, undelivered=1,
+                  note="uav2 holds this tree"),
         ClockRequest(sender="slam"),
         ClockReply(stamp_ns=66_000_000),
         SimClock(stamp_ns=66_000_000, seq=1, phase="running", frames=2),
