@@ -28,6 +28,8 @@ class McapFile:
     def __init__(self, path: Path, about: dict[str, str] | None = None) -> None:
         from mcap.writer import CompressionType, Writer
 
+        from services.recorder.chunk_index import keep_small
+
         try:
             self._file: BinaryIO = path.open("xb")
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -36,6 +38,7 @@ class McapFile:
         self.path = path
         self.messages = 0
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._index = keep_small(self._writer)
         self._writer.start(profile=PROFILE, library="treedock")
         if about:
             self._writer.add_metadata("treedock", about)
@@ -48,6 +51,11 @@ class McapFile:
     def size(self) -> int:
         """Return the bytes written so far."""
         return self._file.tell()
+
+    @property
+    def index_bytes(self) -> int:
+        """Return what is kept in memory of the index that ``close`` will write."""
+        return self._index.size
 
     def add(self, key: str, schema: str, encoding: str, data: bytes, stamp_ns: int, seq: int = 0) -> None:
         """Append one of our messages under its key.

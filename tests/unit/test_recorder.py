@@ -13,6 +13,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from schemas.camera import Intrinsics, RgbdFrame
 from schemas.slam import Pose
@@ -328,6 +329,29 @@ def test_a_disk_error_costs_the_index_and_not_the_file(tmp_path: Path) -> None:
     drain.close()
     assert is_whole(tmp_path / "2.mcap")
     assert recover(tmp_path / "1.mcap").messages == 1
+
+
+def test_the_index_of_a_long_file_takes_little_memory_and_is_whole(tmp_path: Path) -> None:
+    """What was seen in an hour's soak: 14 MB more, the library's own index of two chunks a second."""
+    path, keys, chunks = tmp_path / "long.mcap", 25, 400
+    with McapFile(path) as file:
+        for number in range(chunks):
+            for key in range(keys):
+                file.add(f"key/{key}", "s", "e", bytes(100), number * 500_000_000 + key, number)
+            file.flush(to_disk=False)
+        kept_an_hour = 7200 / chunks * file.index_bytes
+    assert kept_an_hour < 1.5 * MB
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+        assert summary is not None
+        assert len(summary.chunk_indexes) == chunks
+        starts = [index.message_start_time for index in summary.chunk_indexes]
+        assert starts == [number * 500_000_000 for number in range(chunks)]
+        assert all(len(index.message_index_offsets) == keys for index in summary.chunk_indexes)
+        found = make_reader(stream).iter_messages(
+            topics=["key/7"], starting_at=60_000_000_000, ending_before=61_000_000_000
+        )
+        assert [message.sequence for _, _, message in found] == [120, 121]
 
 
 def test_files_are_changed_at_their_size(tmp_path: Path) -> None:
