@@ -14,7 +14,6 @@ from schemas.codec import Wire
 from schemas.timekeeping import ClockReply, ClockRequest
 from schemas.topics import CLOCK, Topic
 from services.common.clock import WallClock
-from services.common.context import HealthBook
 from services.common.timekeeping import OffsetFilter
 
 LOG = logging.getLogger(__name__)
@@ -94,10 +93,3 @@ class ClockSync:
             LOG.warning("this machine's clock is %+.0f ms off the router's: corrected", -offset_ns * 1e-6)
         if step_ns:
             self._stepped(step_ns)
-
-
-def tell(wall: WallClock, book: HealthBook) -> None:
-    """Put the correction into health: microseconds by which the machine's clock is ahead of the router's, or behind."""
-    microseconds = wall.correction_ns // 1000
-    book.counters["clock_behind_us"] = max(0, microseconds)
-    book.counters["clock_ahead_us"] = max(0, -microseconds)

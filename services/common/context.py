@@ -37,6 +37,10 @@ class HealthBook:
         """Add to a counter (``frames``, ``decode_errors``, ``dropped_bad_depth``...)."""
         self.counters[name] += by
 
+    def level(self, name: str, value: int) -> None:
+        """Set a counter to what is there now (megabytes free, minutes left); less than nothing is nothing."""
+        self.counters[name] = max(0, value)
+
     def note(self, topic: str, text: str) -> None:
         """Say what is wrong with ``topic`` and what to do; an empty text withdraws it. Any note means degraded."""
         if text:

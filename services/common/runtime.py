@@ -5,6 +5,7 @@ Health comes from the loop that does the work: while a handler hangs no health g
 
 from __future__ import annotations
 
+import datetime as dt
 import heapq
 import logging
 from collections.abc import Callable
@@ -21,7 +22,7 @@ from schemas.topics import HEALTH, SIM_CLOCK, TOPICS, Topic
 from services.common import sd_notify
 from services.common.bus import Bus
 from services.common.clock import Clock, SimulatedClock, WallClock
-from services.common.clock_sync import ClockSync, tell
+from services.common.clock_sync import ClockSync
 from services.common.config import TreedockConfig
 from services.common.context import HealthBook
 from services.common.errors import InputError
@@ -31,6 +32,8 @@ from services.common.logging import Throttle, set_up
 from services.common.process import started
 from services.common.session import opened_node, shared_memory_note
 from services.common.stop import StopSignal
+from services.common.timekeeping import tell
+from services.security.expiry import Expiry
 
 LOG = logging.getLogger(__name__)
 
@@ -274,12 +277,14 @@ def _serve(context: LiveContext, build: Build, stop: StopSignal) -> int:
         waiting = overdue.update() if overdue else ""
         context.bus.count_overflows()
         tell(context.wall, context.health)
+        expiry.tell(context.health, dt.datetime.now(dt.UTC))
         health = reporter.report(context.wall.now_ns(), context.bus.passed, state, waiting)
         context.publish(HEALTH, health, context.service)
         if overdue is not None:
             # only once ready: the first kick arms the watchdog, and kernels may take longer to load than it waits
             sd_notify.notify("WATCHDOG=1")
 
+    expiry = Expiry(context.config.security, context.uav, context.service)
     if context.service != "router":
         sync = ClockSync(context.service, context.wall, context.bus, context.wall_stepped)
         sync.begin()

@@ -8,8 +8,13 @@ bound is larger than the offset, and nothing is corrected.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 
+from services.common.clock import WallClock
+from services.common.context import HealthBook
+
+_AHEAD, _BEHIND = "clock_ahead_us", "clock_behind_us"
 KEPT = 8
 """Exchanges among which the quickest counts."""
 
@@ -49,3 +54,15 @@ class OffsetFilter:
         if best is None:
             return None
         return 0 if abs(best.offset_ns) <= best.round_trip_ns // 2 else best.offset_ns
+
+
+def tell(wall: WallClock, book: HealthBook) -> None:
+    """Put the correction into health: microseconds by which the machine's clock is ahead of the router's, or behind."""
+    microseconds = wall.correction_ns // 1000
+    book.level(_BEHIND, microseconds)
+    book.level(_AHEAD, -microseconds)
+
+
+def told_ahead_s(counters: Mapping[str, int]) -> float | None:
+    """Return by how much a service's machine is ahead of the router's, as its health tells; None: it does not (an older one)."""
+    return 1e-6 * (counters[_AHEAD] - counters.get(_BEHIND, 0)) if _AHEAD in counters else None

@@ -12,6 +12,12 @@ SILENT_S = 5.0
 RATE_LOW = 0.7
 """Share of a topic's rate in the table below which it is told."""
 CLOCK_WARN_S, CLOCK_FAIL_S = 0.05, 0.5
+EXPIRY_WARN_DAYS, EXPIRY_FAIL_DAYS = 30.0, 1.0 / 24.0
+"""The latter is longer than a flight."""
+_GB = 1_000_000_000
+DISK_WARN_BYTES = 5 * _GB
+_GB_AN_HOUR = 13.0
+"""docs/operations.md, for a forest at 15 Hz."""
 PARAMETERS = "parameters"
 """How the bridge's note begins while parameters speak against a flight."""
 _RESTART = "systemctl restart treedock-{}; journalctl -u treedock-{} -n 50 tells why"
@@ -29,6 +35,8 @@ def aboard(services: Sequence[ServiceFact], vehicle: VehicleFact | None, version
         *(state_of(service) for service in services),
         *versions(services, version),
         *clocks(services),
+        *certificates(services),
+        *disks(services),
         *rates(services),
         *autopilot(services, vehicle),
     ]
@@ -84,6 +92,47 @@ def clocks(services: Sequence[ServiceFact]) -> list[Finding]:
         level: Level = "fail" if abs(offset) > CLOCK_FAIL_S else "warn"
         found.append(Finding("clock", level, words, "synchronise both machines with chrony"))
     return found
+
+
+def certificates(services: Sequence[ServiceFact]) -> Iterator[Finding]:
+    """Return whose certificate ends soon."""
+    for service in services:
+        if service.certificate_days is not None:
+            yield from certificate(f"{service.name}'s", service.certificate_days)
+
+
+def certificate(whose: str, days: float) -> Iterator[Finding]:
+    """Judge the days until a certificate ends: a link whose certificate ends is closed, whatever flies by it."""
+    do = "treedock certs renew (the aircraft's .all, or the station's), then certs export and import"
+    if days <= 0.0:
+        yield Finding("certificate", "fail", f"{whose} expired {-days:.0f} days ago", do)
+    elif days < EXPIRY_FAIL_DAYS:
+        yield Finding("certificate", "fail", f"{whose} expires in {1440.0 * days:.0f} minutes", do)
+    elif days < EXPIRY_WARN_DAYS:
+        yield Finding("certificate", "warn", f"{whose} expires in {days:.0f} days", do)
+
+
+def disks(services: Sequence[ServiceFact]) -> Iterator[Finding]:
+    """Return who records on a disk that is full."""
+    for service in services:
+        if service.disk_free_bytes is not None:
+            yield disk(f"{service.name}'s disk", service.disk_free_bytes, service.disk_reserve_bytes or 0)
+
+
+def disk(about: str, free_bytes: int, reserve_bytes: int) -> Finding:
+    """Judge the room on a disk that is recorded on."""
+    gigabytes, do = (
+        free_bytes / _GB,
+        "copy recordings away and delete them, or recorder.mcap = false: nothing is recorded",
+    )
+    if free_bytes < reserve_bytes:
+        words = f"{gigabytes:.1f} GB left, {reserve_bytes / _GB:.1f} are left free: frames will not be recorded"
+        return Finding(about, "fail", words, do)
+    if free_bytes < DISK_WARN_BYTES:
+        return Finding(
+            about, "warn", f"{gigabytes:.1f} GB left: about {gigabytes / _GB_AN_HOUR:.1f} h of recording", do
+        )
+    return Finding(about, "ok", f"{gigabytes:.0f} GB left")
 
 
 def rates(services: Sequence[ServiceFact]) -> Iterator[Finding]:

@@ -9,7 +9,7 @@ import stat
 import subprocess
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,6 +21,7 @@ from services.common.errors import InputError
 from services.common.memlock import lockable_bytes
 from services.common.version import running_version
 from services.doctor.model import Facts, ServiceFact, VehicleFact
+from services.doctor.told import told
 
 if TYPE_CHECKING:
     from services.common.config import TreedockConfig
@@ -51,6 +52,7 @@ def gather(config: TreedockConfig) -> Facts:
         lockable_bytes=lockable_bytes(),
         shm_free_bytes=_free(Path("/dev/shm")),
         closed=_closed((folder, config.recorder.folder)),
+        disk_reserve_bytes=config.recorder.reserve_mb * 1_000_000,
         disk_free_bytes=_free(_nearest(config.recorder.folder)),
         recordings_cut=_cut(config.recorder.folder),
         camera=camera,
@@ -118,21 +120,15 @@ def _services(heard: _Heard) -> list[ServiceFact]:
     return found
 
 
-def _ahead_s(health: Health) -> float | None:
-    """Return by how much a service's machine is ahead of the router's, as it tells; None: it does not (an older one)."""
-    if "clock_ahead_us" not in health.counters:
-        return None
-    return 1e-6 * (health.counters["clock_ahead_us"] - health.counters.get("clock_behind_us", 0))
-
-
 def _service(health: Health, heard_s: float) -> ServiceFact:
     age_s = time.monotonic() - heard_s
+    fact = told(health, age_s=age_s, clock_offset_s=1e-9 * health.stamp_ns - (time.time() - age_s))
     process = _process_of(health)
-    return ServiceFact(
-        health.service, health.state, health.pid, health.note, age_s, health.rates_hz,
-        locked_bytes=None if process is None else _locked_bytes(process),
-        lockable_bytes=None if process is None else lockable_bytes(health.pid),
-        clock_offset_s=1e-9 * health.stamp_ns - (time.time() - age_s), version=health.version, clock_ahead_s=_ahead_s(health),
+    if process is None:
+        return fact
+    return replace(  # of this machine: its certificates and disk are looked at directly
+        fact, locked_bytes=_locked_bytes(process), lockable_bytes=lockable_bytes(health.pid),
+        certificate_days=None, disk_free_bytes=None,
     )  # fmt: skip
 
 

@@ -6,13 +6,10 @@ from pathlib import Path
 
 from schemas.topics import CAMERA_RGBD
 from services.common.memlock import too_little
-from services.doctor.aboard import aboard
+from services.doctor.aboard import aboard, certificate, disk
 from services.doctor.model import Facts, Finding
 
-EXPIRY_WARN_DAYS = 30
 CALIBRATION_WARN_DAYS = 180
-_GB = 1_000_000_000
-DISK_WARN_BYTES, DISK_FAIL_BYTES = 5 * _GB, _GB // 2
 SHM_WARN_BYTES = 256_000_000
 USB3_MBIT = 5000.0
 LEAST_LOCKED_BYTES = 1_000_000
@@ -70,13 +67,7 @@ def _security(f: Facts) -> list[Finding]:
                 Finding("encryption", "fail", "the bus is plain and listens to other machines: anybody can fly", do)
             ]
         return [Finding("encryption", "ok", "the bus is plain and stays on this machine")]
-    found = []
-    for identity, days in sorted(f.certificates.items()):
-        do = f"treedock certs renew {identity}, then certs export"
-        if days <= 0:
-            found.append(Finding("certificate", "fail", f"{identity} expired {-days:.0f} days ago", do))
-        elif days < EXPIRY_WARN_DAYS:
-            found.append(Finding("certificate", "warn", f"{identity} expires in {days:.0f} days", do))
+    found = [*(_ for identity, days in sorted(f.certificates.items()) for _ in certificate(identity, days))]
     found += [Finding("keys", "fail", f"{path} can be read by others", f"chmod 600 {path}") for path in f.loose_keys]
     found += [
         Finding(
@@ -133,18 +124,7 @@ def _frames_shared(f: Facts, cure: str) -> list[Finding]:
 
 
 def _disk(f: Facts) -> list[Finding]:
-    found = []
-    if f.disk_free_bytes is not None:
-        gigabytes = f.disk_free_bytes / _GB
-        do = "copy recordings away and delete them"
-        if f.disk_free_bytes < DISK_FAIL_BYTES:
-            found.append(Finding("disk", "fail", f"{gigabytes:.1f} GB left: nothing will be recorded", do))
-        elif f.disk_free_bytes < DISK_WARN_BYTES:
-            found.append(
-                Finding("disk", "warn", f"{gigabytes:.1f} GB left: about {gigabytes / 13:.1f} h of recording", do)
-            )
-        else:
-            found.append(Finding("disk", "ok", f"{gigabytes:.0f} GB left"))
+    found = [] if f.disk_free_bytes is None else [disk("disk", f.disk_free_bytes, f.disk_reserve_bytes)]
     if f.recordings_cut:
         words = f"{len(f.recordings_cut)} recording(s) were cut short"
         found.append(Finding("recordings", "warn", words, "treedock recordings --recover"))

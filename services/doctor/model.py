@@ -40,6 +40,11 @@ class ServiceFact:
     """Of the treedock that runs there; empty: it does not say."""
     clock_ahead_s: float | None = None
     """By how much its machine's clock is ahead of the router's, as it measured itself, and corrects; None: not told."""
+    certificate_days: float | None = None
+    """Until its certificate ends; None: not told (a plain bus), or looked at directly."""
+    disk_free_bytes: int | None = None
+    disk_reserve_bytes: int | None = None
+    """Of the disk that it records on, and what it leaves free; None: not told, or looked at directly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +88,8 @@ class Facts:
     closed: Sequence[str] = ()
     """Folders that this user may not look into."""
     disk_free_bytes: int | None = None
+    disk_reserve_bytes: int = 500_000_000
+    """What the recorder leaves free (``recorder.reserve_mb``)."""
     recordings_cut: Sequence[str] = ()
     camera: str | None = None
     """What the configured source found, None when nothing."""

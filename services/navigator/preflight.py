@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from services.common.version import running_version
 from services.doctor.aboard import against_flight
 from services.doctor.model import VehicleFact
@@ -9,6 +11,7 @@ from services.navigator.board import Board
 from services.navigator.config import NavigatorConfig
 
 _VIEW_FRESH_S = 2.0
+_NEEDED = ("camera", "slam", "mapper", "detector", "refiner")
 
 
 def missing(board: Board, config: NavigatorConfig) -> list[str]:
@@ -31,14 +34,19 @@ def missing(board: Board, config: NavigatorConfig) -> list[str]:
         faults.append(
             f"battery at {100.0 * v.battery_share:.0f} %, {100.0 * config.failsafe.battery_start_share:.0f} needed"
         )
-    silent = config.failsafe.service_silent_s
-    faults += [
-        f"{name} is dead or hung"
-        for name in ("camera", "slam", "mapper", "detector", "refiner")
-        if name in board.inputs.services and board.inputs.service_age_s(name) > silent
-    ]
-    # what `treedock doctor` calls a failure of services or autopilot is one here
+    faults += list(_unheard(board, config))
+    # what `treedock doctor` calls a failure of services, versions, clocks, certificates, disk or autopilot is one here
     faults += against_flight(board.inputs.aboard, VehicleFact(v.connected, v.note, v.battery_share), running_version())
     if config.ground_required and board.inputs.service_age_s("station") > config.failsafe.ground_silent_s:
         faults.append("no ground station")
     return faults
+
+
+def _unheard(board: Board, config: NavigatorConfig) -> Iterator[str]:
+    """Yield which of the services that a mission needs say nothing; in memory none of them tells of itself."""
+    heard = board.inputs.services
+    for name in _NEEDED:
+        if heard and name not in heard:
+            yield f"{name} is not up"
+        elif name in heard and board.inputs.service_age_s(name) > config.failsafe.service_silent_s:
+            yield f"{name} is dead or hung"

@@ -30,6 +30,7 @@ from schemas.vehicle import VehicleState
 from services.camera.depth_codec import FrameError, decode_depth
 from services.common.context import Context
 from services.doctor.model import ServiceFact
+from services.doctor.told import told
 from services.navigator.commands import CommandDesk
 from services.navigator.config import NavigatorConfig
 from services.navigator.guard import View, look
@@ -40,6 +41,8 @@ LOG = logging.getLogger(__name__)
 
 WATCHED = ("camera", "slam", "mapper", "detector", "refiner", "autopilot", "station")
 """Services whose health the failsafes look at."""
+_ASKED = (*WATCHED, "router", "recorder", "preview")
+"""Services whose word preflight wants."""
 _STATE_EVERY = 4
 _UNGUARDED = frozenset({"idle", "landed", "failed", "released"})
 """States in which nothing is flown: the eyes are closed."""
@@ -72,7 +75,7 @@ class Navigator:
         c.on(TREES_LIST, self._on_trees)
         c.on(TREES_TARGET, self._on_target)
         c.on(VEHICLE_STATE, self._on_vehicle)
-        for service in WATCHED:
+        for service in _ASKED:
             c.on(HEALTH, self._on_health, leaf=service)
         c.answer(COMMAND_NONCE, NonceRequest, self._on_nonce)
         for name in get_args(CommandName):
@@ -138,10 +141,15 @@ class Navigator:
         self._vehicle = Seen(vehicle, self._context.clock.now_ns())
 
     def _on_health(self, health: Health) -> None:
-        self._services[health.service] = self._context.clock.now_ns()
-        self._aboard[health.service] = ServiceFact(
-            health.service, health.state, health.pid, health.note, 0.0, health.rates_hz, version=health.version
-        )
+        clock = self._context.clock
+        now_ns = clock.now_ns()
+        self._services[health.service] = now_ns
+        if health.state == "stopping":
+            self._aboard.pop(health.service, None)
+            return
+        # stamps of health are the wall's
+        offset_s = None if clock.simulated else 1e-9 * (health.stamp_ns - now_ns)
+        self._aboard[health.service] = told(health, clock_offset_s=offset_s)
 
     def _on_nonce(self, request: NonceRequest) -> NonceReply:
         return self.desk.issue(request.sender, self._context.clock.now_ns())

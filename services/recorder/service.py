@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import datetime as dt
 import logging
-import os
 from functools import partial
 from importlib.metadata import version
-from pathlib import Path
 
 from schemas.camera import RgbdFrame
 from schemas.codec import Wire, encode
@@ -34,6 +32,7 @@ from services.recorder.drain import Drain, Entry, Limits
 from services.recorder.foxglove import Translator, warm
 from services.recorder.mcap_file import McapFile
 from services.recorder.recover import recover_folder
+from services.recorder.space import free_bytes, tell_space
 
 LOG = logging.getLogger(__name__)
 
@@ -82,7 +81,7 @@ class RecorderService:
         self._translator = Translator(context.uav, config.foxglove_image_hz) if config.foxglove else None
         limits = Limits(config.flush_s, config.file_mb * _MB, config.queue_mb * _MB, config.reserve_mb * _MB)
         self._begun = dt.datetime.now(dt.UTC)
-        self.drain = Drain(self._open_file, limits, lambda: _free_bytes(config.folder)) if config.mcap else None
+        self.drain = Drain(self._open_file, limits, lambda: free_bytes(config.folder)) if config.mcap else None
         self._told: dict[str, int] = {}
         self._chronicle = Chronicle(context.uav)
         self._reports, self._reported = 0, False
@@ -115,6 +114,7 @@ class RecorderService:
             health.count(name, value - self._told.get(name, 0))
             self._told[name] = value
         health.note("disk", self.drain.trouble)
+        tell_space(health, self._config.folder, self._config.reserve_mb)
 
     def stop(self) -> None:
         """Complete the file; tell of a mission that had not ended."""
@@ -155,8 +155,3 @@ class RecorderService:
             "begun_utc": f"{self._begun:%Y-%m-%dT%H:%M:%SZ}",
             "config": self._context.config.model_dump_json(),
         }
-
-
-def _free_bytes(folder: Path) -> int:
-    status = os.statvfs(folder)
-    return status.f_bavail * status.f_frsize

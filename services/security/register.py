@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -50,6 +51,11 @@ class Register:
         """Return the common names that have rights."""
         return {e.common_name: Identity.parse(e.identity) for e in self.entries if not e.revoked}
 
+    def valid_until(self, identity: str) -> dt.datetime | None:
+        """Return when the certificate of ``identity`` that has rights ends; None: it has none."""
+        ends = [e.valid_until for e in self.entries if e.identity == identity and not e.revoked]
+        return dt.datetime.fromisoformat(ends[-1]) if ends else None
+
     def write(self, folder: Path) -> None:
         """Write the list.
 
@@ -75,6 +81,7 @@ class Register:
             entries = [Issued(**{**entry, "hosts": tuple(entry["hosts"])}) for entry in body["issued"]]
             for entry in entries:
                 Identity.parse(entry.identity)
+                dt.datetime.fromisoformat(entry.valid_until)
         except OSError as error:
             raise InputError(f"{path}: {error.strerror}; `treedock certs export` puts it there") from error
         except (ValueError, KeyError, TypeError) as error:

@@ -39,10 +39,7 @@ def pair_of(security: SecurityConfig, uav: str, service: str | None) -> Pair | N
     folder = security.folder
     if folder is None:
         return None
-    text = f"{uav}.{service}" if service else security.identity or f"{uav}.{READER}"
-    if service == STATION and security.identity.startswith(f"{STATION}."):
-        text = security.identity  # a ground station of all aircraft, not one aircraft's own
-    identity = Identity.parse(text)
+    identity = shown_by(security, uav, service)
     pair = Pair(folder / "ca.pem", folder / f"{identity.text}.pem", folder / f"{identity.text}.key")
     for path in (pair.ca, pair.certificate, pair.key):
         try:
@@ -53,6 +50,14 @@ def pair_of(security: SecurityConfig, uav: str, service: str | None) -> Pair | N
                 f"{path}: {error.strerror}; `treedock certs issue {identity.text}` and `certs export` put it there"
             ) from error
     return pair
+
+
+def shown_by(security: SecurityConfig, uav: str, service: str | None) -> Identity:
+    """Return whose certificate a service shows, or a tool of the command line (None)."""
+    text = f"{uav}.{service}" if service else security.identity or f"{uav}.{READER}"
+    if service == STATION and security.identity.startswith(f"{STATION}."):
+        text = security.identity  # a ground station of all aircraft, not one aircraft's own
+    return Identity.parse(text)
 
 
 def node_settings(pair: Pair | None) -> Settings:

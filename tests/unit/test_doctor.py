@@ -4,22 +4,39 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
+from schemas.health import Health
+from schemas.topics import HEALTH, VEHICLE_STATE
+from schemas.vehicle import VehicleState
 from services.cli.app import invoke
+from services.common.clock import WallClock
 from services.common.config import TreedockConfig
+from services.common.context import Context, HealthBook
+from services.common.memory import Hub
+from services.common.version import running_version
 from services.doctor.aboard import against_flight
 from services.doctor.facts import gather
 from services.doctor.findings import judge
 from services.doctor.model import Facts, ServiceFact, VehicleFact
+from services.doctor.told import told
+from services.navigator.config import NavigatorConfig
+from services.navigator.preflight import missing
+from services.navigator.service import Navigator
 from services.recorder.config import RecorderConfig
+from services.recorder.space import tell_space
 from services.security.authority import Authority
+from services.security.config import SecurityConfig
+from services.security.expiry import Expiry
 from services.security.identity import Identity
+from tests.examples import all_messages
 
 CAMERA = ServiceFact(
     "camera",
@@ -70,6 +87,26 @@ def test_a_sound_machine_has_no_trouble() -> None:
         (replace(SOUND, closed=("/var/lib/treedock/recordings",)), "rights", "warn", "may not look"),
         (replace(SOUND, disk_free_bytes=10**8), "disk", "fail", "0.1 GB"),
         (replace(SOUND, disk_free_bytes=2 * 10**9), "disk", "warn", "2.0 GB"),
+        (replace(SOUND, disk_free_bytes=10**9, disk_reserve_bytes=2 * 10**9), "disk", "fail", "2.0 are left free"),
+        (
+            replace(SOUND, services=(replace(SLAM, disk_free_bytes=10**8, disk_reserve_bytes=10**9),)),
+            "slam's disk",
+            "fail",
+            "0.1 GB",
+        ),
+        (replace(SOUND, services=(replace(SLAM, disk_free_bytes=10**9),)), "slam's disk", "warn", "0.1 h"),
+        (
+            replace(SOUND, services=(replace(SLAM, certificate_days=0.01),)),
+            "certificate",
+            "fail",
+            "slam's expires in 14 minutes",
+        ),
+        (
+            replace(SOUND, services=(replace(SLAM, certificate_days=3.0),)),
+            "certificate",
+            "warn",
+            "slam's expires in 3 days",
+        ),
         (replace(SOUND, recordings_cut=("a.mcap",)), "recordings", "warn", "1 recording"),
         (replace(SOUND, camera=None), "camera", "fail", "not found"),
         (replace(SOUND, camera_mbit=480.0), "camera", "warn", "480 Mbit/s"),
@@ -110,6 +147,83 @@ def test_preflight_hears_of_failures_and_only_of_those() -> None:
     assert len(told) == 1
     assert "0.1.0+other" in told[0]
     assert against_flight((PX4,), VehicleFact(connected=True, note=WRONG), "0.1.0+same") == [f"PX4: {WRONG}"]
+
+
+def example(kind: type) -> Any:
+    return next(e for e in all_messages().values() if type(e) is kind)
+
+
+def health(service: str, **values: Any) -> Health:
+    given = {
+        "stamp_ns": 1,
+        "seq": 0,
+        "state": "ready",
+        "pid": 7,
+        "uptime_s": 1.0,
+        "counters": {},
+        "rates_hz": {},
+        "work_ms": {},
+    }
+    return Health.model_validate({"service": service, **given, "version": running_version(), **values})
+
+
+def test_what_a_service_tells_of_its_machine_arrives(tmp_path: Path) -> None:
+    book, now = HealthBook(), dt.datetime.now(dt.UTC)
+    tell_space(book, tmp_path, 400)
+    Authority.create(tmp_path, now).issue(Identity.parse("uav1.recorder"), now, days=10)
+    Expiry(SecurityConfig(folder=tmp_path), "uav1", "recorder").tell(book, now)
+    fact = told(health("recorder", counters=dict(book.counters)), clock_offset_s=0.2)
+    assert fact.disk_free_bytes == pytest.approx(shutil.disk_usage(tmp_path).free, abs=2e8)
+    assert fact.disk_reserve_bytes == 400_000_000
+    assert fact.certificate_days == pytest.approx(10.0, abs=0.001)
+    assert fact.clock_offset_s == 0.2
+    plain = HealthBook()
+    Expiry(SecurityConfig(), "uav1", "recorder").tell(plain, now)
+    assert told(health("camera", counters=dict(plain.counters))).certificate_days is None
+    tell_space(plain, tmp_path / "gone", 1)
+    assert told(health("recorder", counters=dict(plain.counters))).disk_free_bytes == 0
+
+
+@pytest.mark.parametrize(
+    ("service", "counters", "word"),
+    [
+        ("recorder", {"disk_free_mb": 100, "disk_reserve_mb": 500}, "recorder's disk: 0.1 GB left"),
+        ("router", {"certificate_minutes_left": 20}, "certificate: router's expires in 20 minutes"),
+        ("station", {"certificate_minutes_left": 0}, "certificate: station's expired"),
+    ],
+)
+def test_preflight_hears_what_the_doctor_would_find(service: str, counters: dict[str, int], word: str) -> None:
+    hub = Hub(TreedockConfig())
+    navigator = Navigator(cast("Context", hub.context("navigator")), NavigatorConfig(live_guard=False))
+    navigator.register(20.0)
+    state = VehicleState(**{**example(VehicleState).model_dump(), "connected": True, "note": ""})
+
+    def told_to_preflight(**values: Any) -> list[str]:
+        hub.context(service).publish(HEALTH, health(service, **values), service)
+        hub.context("autopilot").publish(VEHICLE_STATE, state)
+        hub.run()
+        navigator.step()
+        return missing(navigator.mission.board, navigator.mission.config)
+
+    assert any(word in fault for fault in told_to_preflight(counters=counters))
+    assert not any(word in fault for fault in told_to_preflight(counters={}))
+    told_to_preflight(counters=counters)
+    assert not any(word in fault for fault in told_to_preflight(counters=counters, state="stopping")), (
+        "it was ended on purpose"
+    )
+
+
+def test_preflight_looks_at_the_clocks_where_time_is_the_walls() -> None:
+    hub, wall = Hub(TreedockConfig()), WallClock()
+    context = hub.context("navigator")
+    context.clock = wall  # type: ignore[assignment]
+    navigator = Navigator(cast("Context", context), NavigatorConfig(live_guard=False))
+    for off_s in (-1.2, 1.2, 0.0):
+        navigator._on_health(health("slam", stamp_ns=wall.now_ns() + round(off_s * 1e9)))
+        found = against_flight(tuple(navigator._aboard.values()), None, running_version())
+        assert [f"{1e3 * off_s:+.0f} ms" in fault for fault in found if fault.startswith("clock")] == [True] * bool(
+            off_s
+        )
 
 
 def test_a_camera_is_known_by_its_product_name_and_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

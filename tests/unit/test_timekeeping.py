@@ -10,11 +10,11 @@ import pytest
 from schemas.health import Health
 from schemas.timekeeping import ClockReply
 from services.common.clock import WallClock, on_clock_ns
-from services.common.clock_sync import ClockSync, tell
+from services.common.clock_sync import ClockSync
 from services.common.config import TreedockConfig
 from services.common.context import HealthBook
 from services.common.memory import Hub, MemoryContext
-from services.common.timekeeping import OffsetFilter
+from services.common.timekeeping import OffsetFilter, tell, told_ahead_s
 from services.router.keeper import TimeKeeper
 
 MS = 1_000_000
@@ -59,6 +59,8 @@ def test_a_service_starts_on_the_routers_time() -> None:
     tell(wall, book)
     assert abs(book.counters["clock_behind_us"] - 200_000) < 5_000
     assert book.counters["clock_ahead_us"] == 0
+    assert told_ahead_s(book.counters) == pytest.approx(-0.2, abs=0.005)
+    assert told_ahead_s({}) is None, "an older service says nothing"
 
 
 def test_without_an_answer_the_clock_is_left_alone() -> None:
