@@ -134,10 +134,10 @@ class _Sampler:
     def _sample(self, name: str) -> dict[str, Any] | None:
         try:
             process = psutil.Process(self._rig.pid(name))
-            memory = process.memory_info()
+            memory, cpu = process.memory_info(), process.cpu_times()
             return {
                 "service": name, "pid": process.pid, "rss_mb": round(memory.rss / 2**20, 2), "shm_mb": round(memory.shared / 2**20, 2),
-                "threads": process.num_threads(), "files": process.num_fds(),
+                "threads": process.num_threads(), "files": process.num_fds(), "cpu_s": round(cpu.user + cpu.system, 2),
             }  # fmt: skip
         except (psutil.Error, InputError):
             return None  # between two lives
@@ -152,26 +152,28 @@ def report_of(rows: Sequence[Mapping[str, Any]], kind: str, version: str) -> Ben
     if not rows:
         raise InputError("no sample yet: --minutes is too short")
     names = list(dict.fromkeys(s["service"] for row in rows for s in row["services"]))
-    lines = ["| service | memory (MB) | slope (MB/h) | +- | threads | more | files | more | restarts | grows |",
-             "|---|---|---|---|---|---|---|---|---|---|"]  # fmt: skip
-    grows, total = [], 0.0
+    lines = ["| service | memory (MB) | slope (MB/h) | +- | last third (MB/h) | cores | threads | more | files | more | restarts | grows |",
+             "|---|---|---|---|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    grows, total, late, cores = [], 0.0, 0.0, 0.0
     for name in names:
         samples = [
-            Sample(row["at_s"], name, s["pid"], s["rss_mb"], s["threads"], s["files"])
+            Sample(row["at_s"], name, s["pid"], s["rss_mb"], s["threads"], s["files"], s.get("cpu_s", 0.0))
             for row in rows for s in row["services"] if s["service"] == name
         ]  # fmt: skip
         f = of_service(samples)
         words = faults_of(f)
         grows += [f"{name}: {word}" for word in words]
-        total += f["mb_per_h"]
+        total, late, cores = total + f["mb_per_h"], late + f["mb_per_h_late"], cores + f["cores"]
         lines.append(
-            f"| {name} | {f['rss_mb']:.0f} | {f['mb_per_h']:+.2f} | {f['mb_per_h_error']:.2f} | {f['threads']:.0f} | {f['threads_more']:+.0f} "
-            f"| {f['files']:.0f} | {f['files_more']:+.0f} | {f['restarts']:.0f} | {'; '.join(words)} |"
+            f"| {name} | {f['rss_mb']:.0f} | {f['mb_per_h']:+.2f} | {f['mb_per_h_error']:.2f} "
+            f"| {f['mb_per_h_late']:+.2f} | {f['cores']:.3f} "
+            f"| {f['threads']:.0f} | {f['threads_more']:+.0f} | {f['files']:.0f} | {f['files_more']:+.0f} | {f['restarts']:.0f} | {'; '.join(words)} |"
         )
     last, quarter = rows[-1], rows[len(rows) // 4]
     figures = {
         "minutes": round(last["at_s"] / 60.0, 1), "simulated_minutes": round(last["sim_s"] / 60.0, 1), "missions": last["missions"],
         "docks": last["docks"], "touches": last["touches"], "mb": round(last["rss_mb"], 0), "mb_per_h": round(total, 2),
+        "mb_per_h_late": round(late, 2), "cpu_cores": round(cores, 2),
         "grows": len(grows), "shm_files_more": last["shm_files"] - quarter["shm_files"],
         "pose_hz": round(sum(r["pose_hz"] for r in rows) / len(rows), 2), "pose_hz_spread": round(steady([r["pose_hz"] for r in rows]), 3),
     }  # fmt: skip
@@ -179,6 +181,7 @@ def report_of(rows: Sequence[Mapping[str, Any]], kind: str, version: str) -> Ben
         "what": "missions one after the other, stand-ins for slam, mapper, detector, refiner" if kind == "flight"
         else "the real camera, slam, mapper, detector, refiner over a recording that goes on and on",
         "slopes": "least squares over the last three quarters, by means of twelfths; 'grows' beyond 1 %/h and 3 standard errors",
+        "last third": "the slope of the last third alone, noisier: whether what rose levels off",
         "rates": "poses per second of simulated time (flight), of the wall (chain)",
         "load at the end": f"{os.getloadavg()[0]:.1f}", "code": version,
     }  # fmt: skip

@@ -9,6 +9,8 @@ import numpy as np
 
 WARM_SHARE = 0.25
 """The first part of a run, in which caches fill, is left out of slopes."""
+LATE_SHARE = 2.0 / 3.0
+"""From here on it is looked at whether what rose has levelled off."""
 _BLOCKS = 12
 
 
@@ -22,6 +24,8 @@ class Sample:
     rss_mb: float
     threads: int
     files: int
+    cpu_s: float = 0.0
+    """Processor time of the process so far."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,10 +65,12 @@ def of_service(samples: Sequence[Sample]) -> dict[str, float]:
     late = [s for s in samples if s.at_s >= WARM_SHARE * end_s] or list(samples)
     tenth = max(1, len(late) // 10)
     first, last = late[:tenth], late[-tenth:]
-    line = slope([s.at_s for s in late], [s.rss_mb for s in late])
+    line = slope(*_memory(late))
     return {
         "rss_mb": round(float(np.median([s.rss_mb for s in last])), 1),
         "rss_mb_max": round(max(s.rss_mb for s in late), 1),
+        "mb_per_h_late": round(slope(*_memory([s for s in samples if s.at_s >= LATE_SHARE * end_s])).per_hour, 2),
+        "cores": round(_cores(samples), 3),
         "mb_per_h": round(line.per_hour, 2), "mb_per_h_error": round(min(line.error_per_hour, 1e6), 2),
         "threads": float(np.median([s.threads for s in last])),
         "threads_more": float(np.median([s.threads for s in last]) - np.median([s.threads for s in first])),
@@ -72,6 +78,17 @@ def of_service(samples: Sequence[Sample]) -> dict[str, float]:
         "files_more": float(np.median([s.files for s in last]) - np.median([s.files for s in first])),
         "restarts": float(len({s.pid for s in samples}) - 1),
     }  # fmt: skip
+
+
+def _memory(samples: Sequence[Sample]) -> tuple[list[float], list[float]]:
+    return [s.at_s for s in samples], [s.rss_mb for s in samples]
+
+
+def _cores(samples: Sequence[Sample]) -> float:
+    """Return the processor time per second, of the process that was there last."""
+    own = [s for s in samples if s.pid == samples[-1].pid]
+    passed_s = own[-1].at_s - own[0].at_s
+    return (own[-1].cpu_s - own[0].cpu_s) / passed_s if passed_s > 0.0 else 0.0
 
 
 def faults_of(figures: Mapping[str, float]) -> list[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -28,6 +30,20 @@ def test_a_leak_is_found_with_its_size() -> None:
     figures = of_service(samples(12.0, files_per_h=8.0))
     assert figures["mb_per_h"] == pytest.approx(12.0, abs=0.5)
     assert [word.split(" ")[-1] for word in faults_of(figures)] == ["MB/h", "files"]
+
+
+def test_what_levels_off_is_told_apart_from_what_goes_on() -> None:
+    filling = [replace(s, rss_mb=100.0 + 3.0 * min(s.at_s / 2000.0, 1.0)) for s in samples(0.0)]
+    assert of_service(filling)["mb_per_h"] > 1.0
+    assert abs(of_service(filling)["mb_per_h_late"]) < 0.1
+    assert of_service(samples(12.0))["mb_per_h_late"] == pytest.approx(12.0, abs=1.0)
+
+
+def test_processor_time_is_that_of_the_life_that_was_last() -> None:
+    busy = [replace(s, cpu_s=0.25 * s.at_s) for s in samples(0.0)]
+    assert of_service(busy)["cores"] == pytest.approx(0.25, abs=0.001)
+    busy[200:] = [replace(s, pid=8, cpu_s=0.5 * (s.at_s - 2000.0)) for s in busy[200:]]
+    assert of_service(busy)["cores"] == pytest.approx(0.5, abs=0.001)
 
 
 def test_a_restart_is_told() -> None:
