@@ -18,6 +18,7 @@ import numpy as np
 
 from services.common.config import TreedockConfig
 from services.common.process import prepare_process
+from services.common.timekeeping import told_ahead_s
 from services.evaluate.faults.hosts import HUB, Hosts, enter_fresh, why_not
 from services.evaluate.faults.missions import Back, Flights, Seen, line_of
 from services.evaluate.faults.model import Result
@@ -129,8 +130,7 @@ def clock_off_s(rig: Rig, name: str) -> tuple[float, float]:
         return abs(best) < 0.5 * _CLOCK_S
 
     rig.until(close, end_s - time.monotonic())
-    counters = rig.health[name].counters
-    return (counters.get("clock_ahead_us", 0) - counters.get("clock_behind_us", 0)) * 1e-6, best
+    return told_ahead_s(rig.health[name].counters) or 0.0, best
 
 
 def _doctor(rig: Rig) -> list[str]:
