@@ -2,7 +2,8 @@
 
 The samples lie in ``soak.jsonl``, one line for every ten seconds, written as they come: a run that was broken off is reported as
 far as it came (``--count 0`` is not needed: call again with fewer minutes). ``--scenes chain`` soaks the real camera, slam, mapper,
-detector and refiner over a recording instead of missions with stand-ins.
+detector and refiner over a recording instead of missions with stand-ins; ``--scenes half-speed`` flies half a second a second,
+where others need the processor.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from services.evaluate.soak_figures import Sample, faults_of, of_service, steady
 
 _MINUTES, _QUICK_MINUTES = 60.0, 3.0
 _EVERY_S = 10.0
-_SPEED = 1.0
+_SPEED, _HALF_SPEED = 1.0, 0.5
 _SEED = 9100
 _CODE = ("services.common", "services.navigator", "services.router", "services.recorder", "services.evaluate.faults")
 
@@ -52,9 +53,11 @@ def run(options: BenchOptions) -> BenchReport:
 
             seed = _SEED if options.seed is None else options.seed
             with tempfile.TemporaryDirectory(prefix="treedock-soak-") as folder:
-                (_soak_chain if kind == "chain" else _soak_flights)(
-                    Path(folder), seed, 60.0 * minutes, write, options.tell
-                )
+                if kind == "chain":
+                    _soak_chain(Path(folder), seed, 60.0 * minutes, write, options.tell)
+                else:
+                    speed = _HALF_SPEED if "half-speed" in options.scenes else _SPEED
+                    _soak_flights(Path(folder), seed, 60.0 * minutes, write, options.tell, speed)
         rows = _read(path, version)
     return report_of(rows, kind, version)
 
@@ -76,8 +79,10 @@ def _read(path: Path, version: str) -> list[dict[str, Any]]:
 Write = Callable[[dict[str, Any]], None]
 
 
-def _soak_flights(folder: Path, seed: int, for_s: float, write: Write, tell: Callable[[str], None]) -> None:
-    config = flight_config(seed, folder, speed=_SPEED)
+def _soak_flights(
+    folder: Path, seed: int, for_s: float, write: Write, tell: Callable[[str], None], speed: float
+) -> None:
+    config = flight_config(seed, folder, speed=speed)
     # the disk holds an hour, but no more
     config = config.model_copy(update={"recorder": config.recorder.model_copy(update={"frames": "off", "file_mb": 50})})
     with Rig(config, folder, (*ONBOARD, *GROUND, "simulator")) as rig:
