@@ -10,7 +10,8 @@ from pydantic import Field, field_validator
 from schemas.camera import Intrinsics
 from schemas.envelope import Counter, Message, Name, Part, Quaternion, StampNs, Vec3
 
-SlamStatus = Literal["initialising", "tracking", "lost", "relocalising"]
+SlamStatus = Literal["initialising", "tracking", "lost", "relocalising", "dead_reckoned"]
+"""``dead_reckoned`` comes from fusion alone: the pose is carried on without the first camera, for holding still by only."""
 GraphReason = Literal["keyframe", "local_ba", "loop", "full_ba", "relocalised", "restored"]
 
 
@@ -30,7 +31,10 @@ class Transform(Part):
 
 
 class Pose(Message):
-    """The camera's pose at one frame. Without a trustworthy pose ``T_map_camera`` is absent: never a guess."""
+    """The camera's pose at one frame. Without a trustworthy pose ``T_map_camera`` is absent: never a guess.
+
+    Only with the status ``dead_reckoned`` it is one that no first camera stands behind; its covariance says how good it is.
+    """
 
     SCHEMA: ClassVar[str] = "treedock.pose"
 

@@ -14,6 +14,7 @@ from schemas.codec import Wire
 from schemas.command import Command, NonceRequest
 from schemas.envelope import Message
 from schemas.fleet import ClaimRequest, HeldState
+from schemas.fusion import FusionState
 from schemas.health import Health
 from schemas.mapping import GroundPatch, MapIndex, Submap
 from schemas.navigation import Guidance, MissionState
@@ -23,7 +24,7 @@ from schemas.sketch import SubmapSketch
 from schemas.slam import Graph, Keyframe, Pose
 from schemas.timekeeping import ClockRequest
 from schemas.trees import Target, TreeList
-from schemas.vehicle import VehicleState
+from schemas.vehicle import GpsFix, ImuSamples, VehicleState
 
 PREFIX = "treedock/v1"
 
@@ -99,10 +100,18 @@ ANY = "*"
 
 CAMERA_RGBD = Topic("camera/rgbd", RgbdFrame, "camera", ("slam", "refiner", "navigator", "preview"), 15, 1.0, _H, _LATEST, "data",
                     description="colour and registered depth, raw")  # fmt: skip
+SECOND_RGBD = Topic("second/rgbd", RgbdFrame, "second_camera", ("second_slam",), 15, 1.0, _H, _LATEST, "data", recorded=False,
+                    description="the second camera's frames, raw; only where there is one")  # fmt: skip
+SECOND_POSE = Topic("second/pose", Pose, "second_slam", ("fusion", "simulator"), 15, 0.5, _A, _STREAM, "interactive_high", express=True,
+                    description="the second camera in a map of its own, for fusion alone")  # fmt: skip
 CAMERA_COMPRESSED = Topic("camera/rgbd_compressed", RgbdFrame, "camera", ("slam", "refiner", "navigator", "recorder"), 0, None, _A, _LATEST, "data_low",
                           description="the same as JPEG and PNG, sent only while somebody listens")  # fmt: skip
-SLAM_POSE = Topic("slam/pose", Pose, "slam", ("refiner", "detector", "navigator", "autopilot", "simulator", "station", "preview"), 15, 0.5, _R, _STREAM,
+SLAM_POSE = Topic("slam/pose", Pose, "slam", ("refiner", "detector", "navigator", "autopilot", "simulator", "station", "preview", "fusion"), 15, 0.5, _R, _STREAM,
                   "interactive_high", radio_hz=5, express=True, description="camera in map for each frame, with covariance")  # fmt: skip
+FUSION_POSE = Topic("fusion/pose", Pose, "fusion", ("navigator", "autopilot"), 15, 0.5, _A, _STREAM, "interactive_high", express=True,
+                    description="slam's pose, carried on where slam is lost: taken instead of slam/pose while fusion is on")  # fmt: skip
+FUSION_STATE = Topic("fusion/state", FusionState, "fusion", ("evaluate",), 2, 3.0, _R, _STREAM, "data_high", radio_hz=1,
+                     description="what carries the pose, whether the GPS is believed, the place on the earth")  # fmt: skip
 SLAM_KEYFRAME = Topic("slam/keyframe", Keyframe, "slam", ("mapper",), 0, None, _A, _ADVANCED, "data", cache=64,
                       description="keyframe with compressed depth")  # fmt: skip
 SLAM_GRAPH = Topic("slam/graph", Graph, "slam", ("mapper",), 0, None, _A, _ADVANCED, "data_high",
@@ -125,6 +134,10 @@ MISSION_GUIDANCE = Topic("mission/guidance", Guidance, "navigator", ("autopilot"
                          "interactive_high", express=True, description="one of eight commands with its setpoint")  # fmt: skip
 VEHICLE_STATE = Topic("vehicle/state", VehicleState, "autopilot", ("navigator", "slam", "simulator", "station"), 20, 0.5, _R, _STREAM,
                       "interactive_high", radio_hz=5, express=True, description="mode, arming, attitude, battery")  # fmt: skip
+VEHICLE_IMU = Topic("vehicle/imu", ImuSamples, "autopilot", ("fusion",), 40, 0.3, _A, _STREAM, "data_high", express=True,
+                    description="the autopilot's inertial samples, some to a message; only while fusion is on")  # fmt: skip
+VEHICLE_GPS = Topic("vehicle/gps", GpsFix, "autopilot", ("fusion",), 5, 3.0, _A, _STREAM, "data_high",
+                    description="fixes of the autopilot's GPS receiver; only while fusion wants them")  # fmt: skip
 COMMAND = Topic("cmd/*", Command, "station", ("navigator",), 0, None, _R, _QUERY, "real_time", express=True,
                 description="start hold resume abort land choose next: the reply says accepted or why not")  # fmt: skip
 COMMAND_NONCE = Topic("nonce", NonceRequest, "station", ("navigator",), 0, None, _R, _QUERY, "real_time", express=True,
@@ -141,14 +154,17 @@ HEALTH = Topic("health/*", Health, ANY, ("navigator", "router", "station"), 1, 3
                description="each service's own account of itself")  # fmt: skip
 SIM_RGBD = Topic("sim/rgbd", RgbdFrame, "simulator", ("camera",), 15, None, _H, _LATEST, recorded=False,
                  description="the simulated sensor's frames, for the camera service")  # fmt: skip
+SIM_SECOND = Topic("sim/second", RgbdFrame, "simulator", ("second_camera",), 15, None, _H, _LATEST, recorded=False,
+                   description="the second simulated sensor's frames")  # fmt: skip
 SIM_CLOCK = Topic("sim/clock", SimClock, "simulator", (ANY,), 100, None, _H, _STREAM, "real_time", express=True,
                   description="simulated time")  # fmt: skip
 SIM_TRUTH = Topic("sim/truth", SimTruth, "simulator", ("evaluate",), 15, None, _H, _STREAM,
                   description="true pose and trees: benchmarks and summaries only")  # fmt: skip
 
 TOPICS: tuple[Topic, ...] = (
-    CAMERA_RGBD, CAMERA_COMPRESSED, SLAM_POSE, SLAM_KEYFRAME, SLAM_GRAPH, MAP_CLOUD, MAP_SKETCH, MAP_INDEX, MAP_GROUND, TREES_LIST, TREES_TARGET,
-    MISSION_STATE, MISSION_GUIDANCE, VEHICLE_STATE, COMMAND, COMMAND_NONCE, FLEET_CLAIM, FLEET_HELD, CLOCK, PREVIEW_IMAGE, HEALTH, SIM_RGBD, SIM_CLOCK, SIM_TRUTH,
+    CAMERA_RGBD, SECOND_RGBD, CAMERA_COMPRESSED, SLAM_POSE, SECOND_POSE, FUSION_POSE, FUSION_STATE, SLAM_KEYFRAME, SLAM_GRAPH, MAP_CLOUD,
+    MAP_SKETCH, MAP_INDEX, MAP_GROUND, TREES_LIST, TREES_TARGET, MISSION_STATE, MISSION_GUIDANCE, VEHICLE_STATE, VEHICLE_IMU, VEHICLE_GPS,
+    COMMAND, COMMAND_NONCE, FLEET_CLAIM, FLEET_HELD, CLOCK, PREVIEW_IMAGE, HEALTH, SIM_RGBD, SIM_SECOND, SIM_CLOCK, SIM_TRUTH,
 )  # fmt: skip
 
 LIVE = "live/*"

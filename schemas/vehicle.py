@@ -6,8 +6,9 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from schemas.envelope import Counter, Message, Name, Quaternion, StampNs, Text, Vec3
+from schemas.envelope import Counter, Message, Name, Part, Quaternion, StampNs, Text, Vec3
 
+GpsFixType = Literal["none", "2d", "3d", "differential", "rtk_float", "rtk_fixed"]
 LandedState = Literal["unknown", "on_ground", "taking_off", "in_air", "landing"]
 
 
@@ -36,3 +37,43 @@ class VehicleState(Message):
     """The mission the bridge is or was last engaged for; 0 before the first."""
     link_age_s: Annotated[float, Field(ge=0.0)]
     note: Text = ""
+
+
+class ImuSample(Part):
+    """Means since the sample before, as the sensors gave them (bias and all)."""
+
+    stamp_ns: StampNs
+    gyro_rad_s: Vec3
+    """Body (forward, left, up)."""
+    accel_m_s2: Vec3
+    """Specific force, body: at rest it points up."""
+
+
+class ImuSamples(Message):
+    """The autopilot's inertial samples since the last message, oldest first; only while fusion asks for them."""
+
+    SCHEMA: ClassVar[str] = "treedock.imu"
+
+    stamp_ns: StampNs
+    """Of the newest sample."""
+    seq: Counter
+    samples: Annotated[tuple[ImuSample, ...], Field(min_length=1, max_length=100)]
+
+
+class GpsFix(Message):
+    """One fix of the autopilot's GPS receiver; only while fusion asks for it."""
+
+    SCHEMA: ClassVar[str] = "treedock.gps"
+
+    stamp_ns: StampNs
+    """When the autopilot had it: the fix is older by the receiver's delay."""
+    seq: Counter
+    fix: GpsFixType
+    satellites: Annotated[int, Field(ge=0, le=255)]
+    latitude_deg: Annotated[float, Field(ge=-90.0, le=90.0)]
+    longitude_deg: Annotated[float, Field(ge=-180.0, le=180.0)]
+    altitude_m: Annotated[float, Field(ge=-1e4, le=1e5)]
+    """Above mean sea level."""
+    horizontal_sigma_m: Annotated[float, Field(ge=0.0, le=1e5)] | None
+    """What the receiver says of its error."""
+    vertical_sigma_m: Annotated[float, Field(ge=0.0, le=1e5)] | None

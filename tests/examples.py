@@ -10,6 +10,7 @@ from schemas.camera import Intrinsics, RgbdFrame
 from schemas.codec import Wire
 from schemas.command import Command, CommandReply, NonceReply, NonceRequest
 from schemas.fleet import ClaimGoal, ClaimReply, ClaimRequest, HeldState
+from schemas.fusion import EarthPlace, FusionState
 from schemas.health import Health
 from schemas.mapping import GroundCell, GroundPatch, MapIndex, Submap
 from schemas.navigation import Guidance, MissionState, Setpoint
@@ -19,7 +20,7 @@ from schemas.sketch import SubmapSketch
 from schemas.slam import Graph, GraphNode, Keyframe, Pose, Transform
 from schemas.timekeeping import ClockReply, ClockRequest
 from schemas.trees import Target, Tree, TreeList
-from schemas.vehicle import VehicleState
+from schemas.vehicle import GpsFix, ImuSample, ImuSamples, VehicleState
 
 INTRINSICS = Intrinsics(width=4, height=2, fx=500.0, fy=501.0, cx=1.5, cy=0.5, k1=0.1, depth_scale=1000.0)
 POSE = Transform(position_m=(1.0, -2.0, 0.5), quaternion_xyzw=(0.5, -0.5, 0.5, -0.5))
@@ -106,6 +107,16 @@ def all_messages() -> dict[str, Wire]:
                      quaternion_map_body=(0.0, 0.0, 0.0, 1.0), position_map_m=(0.0, 0.0, 1.5),
                      velocity_map_m_s=(0.0, 0.0, 0.0), battery_share=0.8, vision_fused=True, operator_override=False,
                      engaged_mission_id=1, link_age_s=0.02),
+        ImuSamples(stamp_ns=66_000_000, seq=3, samples=(
+            ImuSample(stamp_ns=58_000_000, gyro_rad_s=(0.01, -0.02, 0.3), accel_m_s2=(0.1, -0.2, 9.8)),
+            ImuSample(stamp_ns=66_000_000, gyro_rad_s=(0.02, -0.01, 0.3), accel_m_s2=(0.2, -0.1, 9.7)))),
+        GpsFix(stamp_ns=66_000_000, seq=2, fix="3d", satellites=14, latitude_deg=47.4, longitude_deg=8.5, altitude_m=488.0,
+               horizontal_sigma_m=1.3, vertical_sigma_m=2.4),
+        FusionState(stamp_ns=66_000_000, seq=2, map_id="map-1", carrier="imu", carried_s=0.4, gps="distrusted",
+                    gps_word="its fixes are not where the aircraft can be", place=EarthPlace(
+                        latitude_deg=47.4, longitude_deg=8.5, altitude_m=488.0, heading_rad=0.3, sigma_m=1.2),
+                    accel_bias_m_s2=(0.05, -0.02, 0.01), gyro_bias_rad_s=(0.001, 0.0, -0.002), restarts=1,
+                    jumps_announced=0),
         Health(service="slam", stamp_ns=66_000_000, seq=1, state="ready", pid=12, uptime_s=3.5,
                counters={"frames": 40}, rates_hz={"camera/rgbd": 15.0}, work_ms={"track": 18.0},
                version="0.1.0+0a1b2c3d"),

@@ -108,7 +108,9 @@ def services_for(tree: TreedockConfig) -> tuple[str, ...]:
     station = station_services()
     shown = (*station, "preview") if station else ()
     kept = ("recorder",) if tree.recorder.mcap or flies(tree) or guides(tree) else ()
-    chain = ("router", *shown, *kept, "camera", "slam", "mapper", "detector", "refiner")
+    second = ("second_camera", "second_slam") if tree.fusion.enabled and tree.fusion.second.enabled else ()
+    fused = ("fusion", *second) if tree.fusion.enabled else ()
+    chain = ("router", *shown, *kept, "camera", "slam", *fused, "mapper", "detector", "refiner")
     if flies(tree):
         return (*chain, "navigator", "autopilot", "simulator")
     if guides(tree):

@@ -16,6 +16,9 @@ SERVICES = {
     "router": "The Zenoh router that all nodes meet at.",
     "camera": "Frames from the sensor, the simulator or a recording.",
     "slam": "The camera's pose for each frame, keyframes and their graph.",
+    "fusion": "Slam's pose with IMU, GPS and a second camera (off by default).",
+    "second_camera": "Frames of a second camera, for fusion.",
+    "second_slam": "The second camera's motion, for fusion.",
     "mapper": "The dense map, submap by submap.",
     "detector": "Trees in the map, by slicing.",
     "refiner": "The target tree in the depth image, at frame rate.",
@@ -26,7 +29,12 @@ SERVICES = {
     "simulator": "A forest, a camera that sees it, and simulated time.",
 }
 
-_MODULES = {"refiner": "services.detector.refine.service", "autopilot": "services.navigator.autopilot.service"}
+_MODULES = {
+    "refiner": "services.detector.refine.service",
+    "autopilot": "services.navigator.autopilot.service",
+    "second_camera": "services.fusion.second_camera",
+    "second_slam": "services.fusion.second_slam",
+}
 
 
 def service_command(name: str) -> Callable[..., int]:

@@ -12,6 +12,7 @@ from services.cli.run_config import SupervisorConfig
 from services.detector.config import DetectorServiceConfig
 from services.detector.refine.config import RefinerConfig
 from services.fine.config import FineConfig
+from services.fusion.config import FusionConfig
 from services.mapper.config import MapperConfig
 from services.navigator.autopilot.config import AutopilotConfig
 from services.navigator.config import NavigatorConfig
@@ -44,6 +45,7 @@ class TreedockConfig(BaseModel):
     supervisor: SupervisorConfig = SupervisorConfig()
     camera: CameraConfig = CameraConfig()
     slam: SlamConfig = SlamConfig()
+    fusion: FusionConfig = FusionConfig()
     mapper: MapperConfig = MapperConfig()
     detector: DetectorServiceConfig = DetectorServiceConfig()
     refiner: RefinerConfig = RefinerConfig()

@@ -17,6 +17,7 @@ from schemas.topics import (
     CAMERA_RGBD,
     COMMAND,
     COMMAND_NONCE,
+    FUSION_POSE,
     HEALTH,
     MISSION_GUIDANCE,
     MISSION_STATE,
@@ -53,8 +54,9 @@ _CARRY_NS = 300_000_000
 class Navigator:
     """Holds the latest of everything and the mission."""
 
-    def __init__(self, context: Context, config: NavigatorConfig) -> None:
+    def __init__(self, context: Context, config: NavigatorConfig, *, fused: bool = False) -> None:
         self._context = context
+        self._fused = fused
         self.mission = Mission(config)
         self.desk = CommandDesk(config.nonce_valid_s, lambda: os.urandom(16))
         self._pose: Seen[Pose] | None = None
@@ -69,7 +71,7 @@ class Navigator:
     def register(self, rate_hz: float) -> None:
         """Connect to the bus."""
         c = self._context
-        c.on(SLAM_POSE, self._on_pose)
+        c.on(FUSION_POSE if self._fused else SLAM_POSE, self._on_pose)
         if self.mission.config.live_guard:
             c.on(CAMERA_COMPRESSED if self.mission.config.frames == "compressed" else CAMERA_RGBD, self._on_frame)
         c.on(TREES_LIST, self._on_trees)
@@ -178,4 +180,4 @@ class Navigator:
 def build(context: Context) -> None:
     """Start the navigator on a context."""
     config = getattr(context.config, "navigator", None) or NavigatorConfig()
-    Navigator(context, config).register(config.rate_hz)
+    Navigator(context, config, fused=context.config.fusion.enabled).register(config.rate_hz)

@@ -25,7 +25,7 @@ def test_keys_are_unique_and_plain() -> None:
 
 def test_every_consumer_and_producer_is_a_process_of_the_design() -> None:
     known = {"camera", "slam", "mapper", "detector", "refiner", "navigator", "autopilot", "simulator", "station",
-             "recorder", "preview", "evaluate", "router", "*"}  # fmt: skip
+             "recorder", "preview", "evaluate", "router", "fusion", "second_camera", "second_slam", "*"}  # fmt: skip
     for topic in TOPICS:
         assert {topic.producer, *topic.consumers} <= known
         assert topic.producer not in topic.consumers
@@ -63,7 +63,7 @@ def test_architecture_page_shows_the_table_as_it_is() -> None:
 
 _ROLES = {
     "camera": "camera", "slam": "slam", "mapper": "mapper", "detector": "detector", "detector/refine": "refiner", "router": "router",
-    "navigator": "navigator", "navigator/autopilot": "autopilot", "preview": "preview", "simulator": "simulator",
+    "navigator": "navigator", "navigator/autopilot": "autopilot", "preview": "preview", "simulator": "simulator", "fusion": "fusion",
 }  # fmt: skip
 
 

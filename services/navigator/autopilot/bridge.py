@@ -22,6 +22,7 @@ from services.navigator.autopilot.engagement import Engagement, Order, Vehicle
 from services.navigator.autopilot.foreign import Foreign
 from services.navigator.autopilot.frames import Mount, to_ned
 from services.navigator.autopilot.parameters import ParameterReader, refusals
+from services.navigator.autopilot.sensors import Sensors
 from services.navigator.autopilot.telemetry import Telemetry
 from services.navigator.autopilot.vision import Vision
 from services.navigator.track import Correction, Step
@@ -42,8 +43,9 @@ _USE_POSITION_VELOCITY_YAW_RATE = 448
 class Bridge:
     """All the bridge knows. ``handle`` takes the autopilot's messages, ``tick`` gives ours."""
 
-    def __init__(self, config: AutopilotConfig) -> None:
+    def __init__(self, config: AutopilotConfig, sensors: Sensors | None = None) -> None:
         self.config = config
+        self.sensors = sensors or Sensors()
         self.mount = Mount.level(config.camera_offset_m, config.camera_pitch_rad, config.camera_yaw_rad)
         self.telemetry = Telemetry(config.component_id)
         self.vision = Vision(config, self.mount)
@@ -95,6 +97,7 @@ class Bridge:
         if self.telemetry.outages != self._outages:
             self._outages = self.telemetry.outages
             self._begin_anew()
+        self.sensors.take(message, received_ns, self.clocks.offset_ns)
         kind = message.get_type()
         if kind == "PARAM_VALUE":
             self.parameters.take(message.param_id, message.param_value, message.param_type)
@@ -177,7 +180,7 @@ class Bridge:
     def _requests(self, system: int, now_ns: int) -> list[Any]:
         """Ask for the streams that do not come, and for the origin until PX4 has told it."""
         out: list[Any] = []
-        for message_id, rate_hz in px4.STREAMS_HZ.items():
+        for message_id, rate_hz in (px4.STREAMS_HZ | self.sensors.streams_hz).items():
             came = self.telemetry.came_ns.get(message_id)
             asked = self.telemetry.acks.get(mav.MAV_CMD_SET_MESSAGE_INTERVAL) is not None
             if not asked or came is None or (now_ns - came) / 1e9 > max(3.0 / rate_hz, 0.5):

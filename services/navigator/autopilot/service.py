@@ -7,12 +7,14 @@ import logging
 
 from schemas.navigation import Guidance
 from schemas.slam import Pose
-from schemas.topics import MISSION_GUIDANCE, SLAM_POSE, VEHICLE_STATE
+from schemas.topics import FUSION_POSE, MISSION_GUIDANCE, SLAM_POSE, VEHICLE_GPS, VEHICLE_IMU, VEHICLE_STATE
 from services.common.context import Context
+from services.fusion.config import FusionConfig
 from services.navigator.autopilot.bridge import Bridge
 from services.navigator.autopilot.config import AutopilotConfig
 from services.navigator.autopilot.link import Codec, Link, MavlinkLink, read_secret
 from services.navigator.autopilot.parameters import differences, table
+from services.navigator.autopilot.sensors import Sensors
 from services.navigator.autopilot.wire import open_wire
 
 LOG = logging.getLogger(__name__)
@@ -21,10 +23,15 @@ LOG = logging.getLogger(__name__)
 class Autopilot:
     """Drives a bridge over a link."""
 
-    def __init__(self, context: Context, config: AutopilotConfig, link: Link) -> None:
+    def __init__(
+        self, context: Context, config: AutopilotConfig, link: Link, fusion: FusionConfig | None = None
+    ) -> None:
         self._context = context
         self._link = link
-        self.bridge = Bridge(config)
+        fusion = fusion or FusionConfig()
+        self._fused = fusion.enabled
+        imu_hz, gps_hz = fusion.imu_hz * fusion.imu, fusion.gps_hz * fusion.gps
+        self.bridge = Bridge(config, Sensors(imu_hz, gps_hz) if fusion.enabled else None)
         self._identified: int | None = None
         """The system as whose component we speak."""
         self._note = ""
@@ -35,7 +42,7 @@ class Autopilot:
     def register(self) -> None:
         """Connect to the bus."""
         c, config = self._context, self.bridge.config
-        c.on(SLAM_POSE, self._on_pose)
+        c.on(FUSION_POSE if self._fused else SLAM_POSE, self._on_pose)
         c.on(MISSION_GUIDANCE, self._on_guidance)
         c.every(config.poll_s, self.tick)
         c.every(1.0 / config.state_hz, self._publish_state)
@@ -48,7 +55,18 @@ class Autopilot:
         if system is not None and system != self._identified:
             self._link.identify(system)
             self._identified = system
+        self._tell_sensors()
         self._send()
+
+    def _tell_sensors(self) -> None:
+        """Pass on what the raw sensors said, if fusion asked for it."""
+        imu, fix = self.bridge.sensors.imu(), self.bridge.sensors.fix()
+        if imu is not None:
+            self._context.publish(VEHICLE_IMU, imu)
+            self._context.health.count("imu_samples", len(imu.samples))
+        if fix is not None:
+            self._context.publish(VEHICLE_GPS, fix)
+            self._context.health.count("gps_fixes")
 
     def _send(self) -> None:
         for message in self.bridge.tick(self._context.clock.now_ns()):
@@ -107,4 +125,4 @@ def build(context: Context) -> None:
     on_stop = getattr(context, "on_stop", None)
     if on_stop is not None:
         on_stop(link.close)
-    Autopilot(context, config, link).register()
+    Autopilot(context, config, link, context.config.fusion).register()

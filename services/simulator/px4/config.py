@@ -61,6 +61,31 @@ class WindConfig(BaseModel):
     gust_time_s: Positive = 2.5
 
 
+class GpsConfig(BaseModel):
+    """A GPS receiver under trees: errors, delay, and faults at times since the start. Absent unless asked for."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    present: bool = False
+    rate_hz: Positive = 5.0
+    white_m: NonNegative = 0.4
+    """Horizontal noise from fix to fix, one axis."""
+    slow_m: NonNegative = 1.2
+    """Standard deviation of the slow error (first-order Gauss-Markov over ``slow_s``), one axis."""
+    slow_s: Positive = 80.0
+    vertical_factor: Positive = 1.8
+    velocity_m_s: NonNegative = 0.15
+    delay_s: NonNegative = 0.1
+    outages_s: tuple[tuple[float, float], ...] = ()
+    """(begin, end) of times without a fix."""
+    jump_at_s: float | None = None
+    jump_m: tuple[float, float] = (8.0, 6.0)
+    """North and east: from ``jump_at_s`` on all fixes are off by this."""
+    drag_from_s: float | None = None
+    drag_m_s: tuple[float, float] = (0.15, -0.1)
+    """North and east: from ``drag_from_s`` on the fixes are dragged away so fast (a spoofer that takes over softly)."""
+
+
 class LinkConfig(BaseModel):
     """Where the endpoint talks: like PX4 it sends from a bound port to one remote."""
 
@@ -81,6 +106,7 @@ class Px4Config(BaseModel):
     airframe: AirframeConfig = AirframeConfig()
     sensors: SensorConfig = SensorConfig()
     wind: WindConfig = WindConfig()
+    gps: GpsConfig = GpsConfig()
     system_id: Annotated[int, Field(ge=1, le=255)] = 1
     step_s: Positive = 0.004
     battery_share: Share = 1.0

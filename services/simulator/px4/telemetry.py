@@ -31,6 +31,7 @@ _LANDED = {
 _CELL_MV, _CELL_EMPTY_MV, _CELLS = 4150, 3500, 4
 _UPPER_TRIANGLE = 21
 _GRAVITY_M_S2 = 9.80665
+_FIX_LOST_S = 1.0
 
 
 def _boot_ms(v: Vehicle) -> int:
@@ -222,6 +223,38 @@ def hil_state_quaternion(v: Vehicle) -> Message:
     )  # fmt: skip
 
 
+def highres_imu(v: Vehicle) -> Message:
+    """HIGHRES_IMU: the last inertial sample as it was measured, bias and all; no magnetometer, no pressure told."""
+    if not math.isfinite(v.last_imu_s):
+        return None
+    accel, gyro = (tuple(float(c) for c in values) for values in (v.last_accel_m_s2, v.last_gyro_rad_s))
+    fields = 0b111111
+    return m.MAVLink_highres_imu_message(
+        round(v.last_imu_s * 1e6), *accel, *gyro, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 25.0, fields
+    )
+
+
+def gps_raw_int(v: Vehicle) -> Message:
+    """GPS_RAW_INT of the last fix; without a receiver none, and in an outage one that says so, as PX4 does."""
+    if v.gps is None or v.gps.latest is None:
+        return None
+    fix = v.gps.latest
+    now_s = v.now_s - v.config.boot_time_s
+    if now_s - fix.given_s > _FIX_LOST_S:
+        return m.MAVLink_gps_raw_int_message(
+            round(v.now_s * 1e6), m.GPS_FIX_TYPE_NO_FIX, 0, 0, 0, 9999, 9999, 65535, 65535, 3
+        )
+    x, y, z = (float(c) for c in fix.position_ned_m)
+    latitude, longitude, height = to_global(TRUTH_ORIGIN, (x, y, z))
+    north, east = (float(c) for c in fix.velocity_ned_m_s[:2])
+    return m.MAVLink_gps_raw_int_message(
+        round((v.config.boot_time_s + fix.given_s) * 1e6), m.GPS_FIX_TYPE_3D_FIX, round(latitude * 1e7), round(longitude * 1e7),
+        round(height * 1e3), 90, 140, round(100.0 * math.hypot(north, east)),
+        round(math.degrees(math.atan2(east, north)) % 360.0 * 100.0) % 36000, 14, round(height * 1e3),
+        round(1e3 * fix.sigma_m), round(1e3 * fix.vertical_sigma_m), 200, 0,
+    )  # fmt: skip
+
+
 def autopilot_version(v: Vehicle) -> Message:
     """AUTOPILOT_VERSION: PX4 1.16.0 and what it can do."""
     can = (
@@ -254,6 +287,8 @@ BUILDERS: dict[int, Builder] = {
     m.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: global_position_int,
     m.MAVLINK_MSG_ID_HOME_POSITION: home_position,
     m.MAVLINK_MSG_ID_HIL_STATE_QUATERNION: hil_state_quaternion,
+    m.MAVLINK_MSG_ID_HIGHRES_IMU: highres_imu,
+    m.MAVLINK_MSG_ID_GPS_RAW_INT: gps_raw_int,
     m.MAVLINK_MSG_ID_AUTOPILOT_VERSION: autopilot_version,
 }
 """By message id."""

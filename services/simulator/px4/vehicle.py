@@ -27,6 +27,7 @@ from services.simulator.px4.frames import (
     rotation_from_wxyz,
     yaw_from_wxyz,
 )
+from services.simulator.px4.gps import GpsReceiver
 from services.simulator.px4.modes import Commander, NavState, Situation
 from services.simulator.px4.params import Parameters
 from services.simulator.px4.quadrotor import GroundHeight, Quadrotor
@@ -69,6 +70,9 @@ class Vehicle:
         self.last_ground_station_s = -math.inf
         self.last_companion_s = -math.inf
         self.last_gyro_rad_s = np.zeros(3)
+        self.last_accel_m_s2 = np.zeros(3)
+        self.last_imu_s = -math.inf
+        self.gps = GpsReceiver(config.gps, seed) if config.gps.present else None
         self.external = Setpoint()
         self._controller = PositionController(self.params)
         self._attitude_sp = AttitudeSetpoint(np.array([0.0, 0.0, -1.0]), 0.0, 0.0, 0.0)
@@ -121,8 +125,10 @@ class Vehicle:
         if self.ticks % _IMU_EVERY == 0:
             self.estimator.landed = self.land.landed
             self.estimator.add_imu(self.now_s, self._gyro, self._accel, dt_s * _IMU_EVERY)
-            self.last_gyro_rad_s = self._gyro
+            self.last_gyro_rad_s, self.last_accel_m_s2, self.last_imu_s = self._gyro, self._accel, self.now_s
             self._gyro, self._accel = np.zeros(3), np.zeros(3)
+        if self.gps is not None:
+            self.gps.update(self.ticks * dt_s, self.body.state[:3], self.body.state[3:6])
         if self.ticks % _CONTROL_EVERY == 0:
             self._control(dt_s * _CONTROL_EVERY)
         if self.ticks % _IMU_EVERY == 0:

@@ -1,0 +1,324 @@
+"""Fusion itself: slam's places of one or two cameras, IMU and GPS in; the first camera's pose in slam's map out.
+
+While the first camera is located its pose *is* slam's, byte for byte: nothing that GPS or IMU say moves it. What they move
+is the smoother's world W, which is odometry. When slam is lost the pose is the last located one carried on by the motion in
+W since then, with that motion's joint covariance, and for so long as ``config`` allows. See docs/decisions/fusion.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from schemas.fusion import Carrier
+from services.common.geometry import Matrix, inverse, rotation_z
+from services.fusion.config import FusionConfig
+from services.fusion.gps import GpsDesk
+from services.fusion.inertial import Inertial
+from services.fusion.sight import Doubt, Sight, contradicts
+from services.fusion.smoother import Smoother, State
+from services.fusion.values import (
+    Fused,
+    GpsReading,
+    ImuReading,
+    Located,
+    Moved,
+    adjoint,
+    carried,
+    relative,
+)
+
+_TIE = np.diag(np.repeat([0.02**2, 0.05**2], 3))
+"""What a place found again adds to the doubt of the step over the gap: it may be another tree that looks the same."""
+_RIPE_S = 1.0
+"""Velocity and bias are known after this; before, the IMU contradicts nobody."""
+_WALK_M_S = 1.0
+_NONE = -1
+_IMU_LATE_NS = 300_000_000
+"""Samples that are late by less come yet; beyond, the window goes on without."""
+_IMU_BACK_NS = 300_000_000
+"""An IMU that has told so much without a gap is taken in again."""
+
+
+@dataclass(slots=True)
+class _Anchor:
+    """The last state at which the first camera was located."""
+
+    index: int
+    located: Located
+
+
+class Fuser:
+    """One flight. Pure but for gtsam: the same inputs give the same outputs."""
+
+    def __init__(self, config: FusionConfig, T_body_camera: Matrix, T_body_second: Matrix | None = None) -> None:
+        self.config = config
+        self._T_body_camera, self._T_body_second = T_body_camera, T_body_second
+        self.inertial = Inertial(config.imu_noise)
+        self.gps: GpsDesk | None = GpsDesk(config) if config.gps else None
+        self.smoother: Smoother | None = None
+        self.restarts = self.jumps_announced = self.contradicted = 0
+        self.resets = 0
+        """Added to slam's own reset counter: jumps that slam did not tell."""
+        self._anchor: _Anchor | None = None
+        self._doubt = Doubt(config)
+        self._first, self._second = Sight(), Sight()
+        self._joined: tuple[int, Located] | None = None
+        """The newest state at which the second camera is located."""
+        self._checked = -1
+        self._seen_ns = self._seen_second_ns = self._began_ns = -1
+        self._blind = True
+
+    # -- in -----------------------------------------------------------------------------------------------------
+    def imu(self, reading: ImuReading) -> None:
+        """Take an IMU reading."""
+        if self.config.imu:
+            self.inertial.add(reading)
+
+    def fix(self, reading: GpsReading) -> None:
+        """Take a fix."""
+        if self.gps is not None:
+            self.gps.take(reading)
+
+    def camera(self, stamp_ns: int, located: Located | None) -> Fused | None:
+        """Take a frame of the first camera, located or not; return the pose to tell, None when there is none."""
+        self._first.take(stamp_ns, located)
+        if self.smoother is None:
+            return None if located is None else self._begin(located)
+        if stamp_ns <= self.smoother.last.stamp_ns:
+            return self._as_told(located)
+        if not self._felt(stamp_ns):
+            late = stamp_ns - self.inertial.newest_ns < _IMU_LATE_NS and self.smoother.inertial
+            return self._as_told(located) if late else self._restart(located)
+        if located is not None and self._contradicted(located):
+            located = None
+        if located is not None:
+            return self._follow(located)
+        return self._carry(stamp_ns) if self.smoother.inertial else None
+
+    def second(self, stamp_ns: int, located: Located | None) -> Fused | None:
+        """Take a frame of the second camera; a pose is returned only where it alone tells the motion (no IMU)."""
+        if self._T_body_second is None:
+            return None
+        self._second.take(stamp_ns, located)
+        s = self.smoother
+        if located is None or s is None:
+            return None
+        self._seen_second_ns = stamp_ns
+        self._join_second()
+        lost = self._first.newest_ns >= stamp_ns and self._first.at(stamp_ns) is None
+        alone = not s.inertial and stamp_ns > s.last.stamp_ns and lost
+        if not alone or self._joined is None or self._joined[1].epoch != located.epoch:
+            return None
+        if self._joined[0] != s.last.index:
+            return None
+        state = s.step(stamp_ns, relative(self._joined[1], located, self._T_body_second))
+        return self._told_at(state)
+
+    def silence(self, stamp_ns: int) -> Fused | None:
+        """Return the pose at a moment for which no frame came, carried on by the IMU."""
+        s = self.smoother
+        if s is None or not s.inertial or stamp_ns <= s.last.stamp_ns:
+            return None
+        return self._carry(stamp_ns) if self.inertial.covers(s.last.stamp_ns, stamp_ns) else None
+
+    def _felt(self, stamp_ns: int) -> bool:
+        """Whether the window can go on to a moment: the IMU has told all of the time, or none of it is looked for."""
+        s = self.smoother
+        assert s is not None
+        if s.inertial:
+            return self.inertial.covers(s.last.stamp_ns, stamp_ns)
+        return not (self.config.imu and self.inertial.covers(stamp_ns - _IMU_BACK_NS, stamp_ns))
+
+    # -- the located camera -------------------------------------------------------------------------------------
+    def _begin(self, located: Located, T_W_body: Matrix | None = None, velocity: Matrix | None = None) -> Fused:
+        """Start a window at a located frame; W is the map, or goes on where the last window ended."""
+        with_imu = self.config.imu and self.inertial.covers(located.stamp_ns - 50_000_000, located.stamp_ns)
+        s = Smoother(self.config, self.inertial if with_imu else None)
+        if T_W_body is None:
+            T_W_body = located.T_map_camera @ inverse(self._T_body_camera)
+        tilt = max(0.03, float(np.sqrt(located.covariance.diagonal()[3:5].max())))
+        s.begin(located.stamp_ns, T_W_body, tilt, velocity)
+        self.smoother, self._anchor = s, _Anchor(0, located)
+        self._joined, self._checked, self._began_ns = None, -1, located.stamp_ns
+        self._doubt.clear()
+        self._solve()
+        return self._as_told(located)  # type: ignore[return-value]
+
+    def _restart(self, located: Located | None) -> Fused | None:
+        """Begin a new window where the map says that the old one has got to: the IMU's readings have a gap."""
+        if located is None or self.smoother is None:
+            return None
+        self.restarts += 1
+        return self._begin(located, self._reached(located))
+
+    def _reached(self, located: Located) -> Matrix | None:
+        """Return ``T_W_body`` at a located frame through the map, from the last located state."""
+        anchor, s = self._anchor, self.smoother
+        if anchor is None or s is None:
+            return None
+        T = s.state(anchor.index).T_W_body if s.holds(anchor.index) else s.last.T_W_body
+        if anchor.located.epoch[0] != located.epoch[0]:
+            self._unknown_way((located.stamp_ns - anchor.located.stamp_ns) * 1e-9 * _WALK_M_S)
+            return T
+        return T @ relative(anchor.located, located, self._T_body_camera).T
+
+    def _follow(self, located: Located) -> Fused | None:
+        """Go on with a located frame; a state is made of it when one is due."""
+        s, anchor = self._window()
+        self._seen_ns = located.stamp_ns
+        due = located.stamp_ns - s.last.stamp_ns >= self.config.state_s * 1e9
+        same = anchor.located.epoch == located.epoch and anchor.index == s.last.index
+        if not (due or self._blind or not same):
+            return self._as_told(located)
+        if not same and not s.inertial and anchor.located.epoch[0] != located.epoch[0]:
+            return self._restart(located)
+        step = relative(anchor.located, located, self._T_body_camera)
+        state = s.step(located.stamp_ns, step)
+        if same:
+            s.join(anchor.index, state.index, step)
+        elif anchor.located.epoch[0] == located.epoch[0] and s.holds(anchor.index):
+            s.join(anchor.index, state.index, Moved(step.T, step.covariance + _TIE), robust=True)
+        elif self._blind:
+            self._unknown_way(_WALK_M_S)
+        self._anchor, self._blind = _Anchor(state.index, located), False
+        if not self._settle(state, seen=True):
+            return self._begin(located, state.T_W_body)
+        return self._as_told(located)
+
+    def _contradicted(self, located: Located) -> bool:
+        """Whether the IMU says that the camera cannot be where slam says; what slam keeps to is believed in the end."""
+        s, anchor = self._window()
+        ripe = (located.stamp_ns - self._began_ns) * 1e-9 >= _RIPE_S
+        told = located.epoch[1] != anchor.located.epoch[1] and not self._blind
+        if (
+            not (s.inertial and ripe)
+            or located.epoch[0] != anchor.located.epoch[0]
+            or told
+            or not s.holds(anchor.index)
+        ):
+            return False
+        felt = Moved(inverse(s.state(anchor.index).T_W_body) @ s.predict(located.stamp_ns), self._felt_covariance())
+        if not contradicts(relative(anchor.located, located, self._T_body_camera), felt, self.config):
+            self._doubt.clear()
+            return False
+        if not self._doubt.stands(located):
+            self.contradicted += 1
+            return True
+        self._doubt.clear()
+        if located.epoch == anchor.located.epoch:
+            self.resets += 1
+            self.jumps_announced += 1
+        self._anchor = _Anchor(_NONE, located)  # nothing joins the two places
+        return False
+
+    def _felt_covariance(self) -> Matrix:
+        s, anchor = self._window()
+        return s.moved(anchor.index, s.last.index).covariance if anchor.index != s.last.index else np.zeros((6, 6))
+
+    # -- without the first camera -------------------------------------------------------------------------------
+    def _carry(self, stamp_ns: int) -> Fused | None:
+        """Carry the last located pose on to a moment."""
+        assert self.smoother is not None
+        return self._told_at(self.smoother.step(stamp_ns))
+
+    def _told_at(self, state: State) -> Fused | None:
+        s, anchor = self._window()
+        if not self._blind and self.gps is not None:
+            self.gps.blind()
+        self._blind = True
+        s.keep(anchor.index)
+        if not self._settle(state, seen=self._carried_by_second(state.stamp_ns)):
+            return None
+        carrier: Carrier = "second" if self._carried_by_second(state.stamp_ns) else "imu"
+        limit_s = self.config.second_alone_s if carrier == "second" else self.config.imu_alone_s
+        if (state.stamp_ns - anchor.located.stamp_ns) * 1e-9 > limit_s or not s.holds(anchor.index):
+            return None
+        pose, covariance = self.carried_to(state.index)
+        if float(np.sqrt(covariance.diagonal()[:3].max())) > self.config.sigma_m:
+            return None
+        return Fused(state.stamp_ns, pose, covariance, carrier)
+
+    def carried_to(self, index: int) -> tuple[Matrix, Matrix]:
+        """Return the first camera's pose and covariance in the map at a state after the last located one."""
+        s, anchor = self._window()
+        moved = s.moved(anchor.index, index)
+        A = adjoint(inverse(self._T_body_camera))
+        T = inverse(self._T_body_camera) @ moved.T @ self._T_body_camera
+        return carried(anchor.located, T, A @ moved.covariance @ A.T)
+
+    def _carried_by_second(self, stamp_ns: int) -> bool:
+        return self._seen_second_ns >= 0 and stamp_ns - self._seen_second_ns < 200_000_000
+
+    # -- the window ---------------------------------------------------------------------------------------------
+    def _settle(self, state: State, *, seen: bool) -> bool:
+        """Join what else is known of the states and solve; False when the window broke and a new one is needed."""
+        s = self.smoother
+        assert s is not None
+        self._join_second()
+        if self.gps is not None:
+            for placement in self.gps.due(s.states, seen=seen):
+                if s.holds(placement.index):
+                    antenna = np.asarray(self.config.gps_noise.antenna_m)
+                    s.place(placement.index, placement.position_W_m, placement.covariance, antenna)
+        del state
+        return self._solve()
+
+    def _join_second(self) -> None:
+        """Join states by the second camera, as far as its slam has answered."""
+        s = self.smoother
+        if s is None or self._T_body_second is None:
+            return
+        for state in s.states:
+            if state.index <= self._checked:
+                continue
+            if state.stamp_ns > self._second.newest_ns:
+                return
+            self._checked = state.index
+            located = self._second.at(state.stamp_ns)
+            if located is None:
+                continue
+            before, self._joined = self._joined, (state.index, located)
+            if before is not None and before[1].epoch == located.epoch and s.holds(before[0]):
+                s.join(before[0], state.index, relative(before[1], located, self._T_body_second))
+
+    def _window(self) -> tuple[Smoother, _Anchor]:
+        """Return both, once there are any."""
+        assert self.smoother is not None
+        assert self._anchor is not None
+        return self.smoother, self._anchor
+
+    def _solve(self) -> bool:
+        s = self.smoother
+        assert s is not None
+        try:
+            s.solve()
+        except RuntimeError:  # gtsam's: an indeterminate window
+            self.restarts += 1
+            self.smoother = None
+            return False
+        return True
+
+    def _unknown_way(self, by_m: float) -> None:
+        if self.gps is not None:
+            self.gps.geo.shift_world(by_m)
+
+    def _as_told(self, located: Located | None) -> Fused | None:
+        if located is None:
+            return None
+        return Fused(located.stamp_ns, located.T_map_camera, located.covariance, "camera")
+
+    # -- what else is known -------------------------------------------------------------------------------------
+    def on_earth(self) -> tuple[Matrix, Matrix, float] | None:
+        """Return the body's place (east, north, up), its attitude on the earth (3, 3), and its horizontal sigma."""
+        if self.gps is None or self.gps.geo.state is None or self.smoother is None:
+            return None
+        T = self.smoother.last.T_W_body
+        R = rotation_z(float(self.gps.geo.state.x[0])) @ T[:3, :3]
+        return self.gps.geo.on_earth(T[:3, 3]), R, self.gps.geo.sigma_m(T[:3, 3])
+
+    @property
+    def bias(self) -> tuple[Matrix, Matrix]:
+        """The IMU's bias as estimated."""
+        return (np.zeros(3), np.zeros(3)) if self.smoother is None else self.smoother.bias
