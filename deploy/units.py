@@ -34,11 +34,15 @@ class Unit:
     """Of the ground station, not aboard."""
     calls: tuple[str, ...] = ()
     """System calls beyond those that all services may make."""
+    optional: bool = False
+    """Not started with the others: enabled by who switched it on in the configuration."""
 
+
+_CAMERAS = ("char-video4linux rw", "char-usb_device rw", "char-media rw")
 
 UNITS: tuple[Unit, ...] = (
     Unit("router", "the Zenoh router that all nodes meet at", 500, 300),
-    Unit("camera", "frames from the depth camera", 400, 800, compiles=True, devices=("char-video4linux rw", "char-usb_device rw", "char-media rw"),
+    Unit("camera", "frames from the depth camera", 400, 800, compiles=True, devices=_CAMERAS,
          groups=("video", "plugdev")),
     # mapping gives way to tracking: a thread may lower its own priority, not raise it
     Unit("slam", "the camera's pose for each frame", 900, 1200, compiles=True, calls=("setpriority",)),
@@ -48,6 +52,10 @@ UNITS: tuple[Unit, ...] = (
     Unit("navigator", "the mission", 800, 600),
     Unit("autopilot", "the bridge to PX4", 1000, 300,
          devices=("char-ttyACM rw", "char-ttyUSB rw", "char-ttyAMA rw", "char-ttyS rw"), groups=("dialout",)),
+    Unit("fusion", "slam's pose with IMU, GPS and a second camera", 850, 400, optional=True),
+    Unit("second_camera", "frames from a second depth camera", 400, 800, compiles=True, devices=_CAMERAS, groups=("video", "plugdev"),
+         optional=True),
+    Unit("second_slam", "the second camera's motion", 600, 1200, compiles=True, calls=("setpriority",), optional=True),
     Unit("preview", "a small picture for the ground", 50, 400, compiles=True),
     Unit("recorder", "everything worth keeping, into MCAP files", 80, 600, state="treedock treedock/recordings"),
     Unit("station", "the ground station's page and inventory", 100, 800, ground=True, state="treedock treedock/inventory"),
@@ -140,7 +148,7 @@ WantedBy={target}
 def target_text(*, ground: bool) -> str:
     """Return the target that starts and stops the services of an aircraft, or of the ground station."""
     where = "ground station" if ground else "aircraft"
-    wanted = [f"treedock-{unit.name}.service" for unit in UNITS if unit.ground == ground]
+    wanted = [f"treedock-{unit.name}.service" for unit in UNITS if unit.ground == ground and not unit.optional]
     return f"""\
 # made by deploy/units.py: change the table there, not this file
 [Unit]

@@ -16,7 +16,7 @@ from services.cli.certs import certs_app
 from services.cli.config_command import config
 from services.cli.inventory import inventory_app
 from services.cli.run import run
-from services.cli.service_command import SERVICES, service_command
+from services.cli.service_command import OPTIONAL, SERVICES, service_command
 from services.cli.topic import topic_app
 from services.common.errors import GoalNotReachedError, InputError
 from services.common.process import prepare_process
@@ -64,7 +64,7 @@ def make_app() -> typer.Typer:
     app.add_typer(inventory_app, name="inventory")
     app.add_typer(certs_app, name="certs")
     app.command()(config)
-    for name, about in SERVICES.items():
+    for name, about in (SERVICES | OPTIONAL).items():
         app.command(name, help=about, rich_help_panel="Services (each its own process)")(service_command(name))
     return app
 

@@ -149,7 +149,7 @@ def _issue(authority: Authority, name: str, days: int, hosts: Sequence[str] | No
 
 def _expanded(names: Sequence[str], authority: Authority | None = None) -> list[str]:
     """Return the identities, with ``uav1.all`` replaced by the aircraft's services (those issued, when there is a list)."""
-    from services.cli.service_command import SERVICES
+    from services.cli.service_command import OPTIONAL, SERVICES
     from services.security.identity import READER
 
     found: list[str] = []
@@ -158,7 +158,7 @@ def _expanded(names: Sequence[str], authority: Authority | None = None) -> list[
         if not (dot and role == "all"):
             found.append(name)
         elif authority is None:
-            aboard = [service for service in SERVICES if service not in {"simulator", "station"}]
+            aboard = [service for service in (*SERVICES, *OPTIONAL) if service not in {"simulator", "station"}]
             found += [f"{uav}.{service}" for service in (*aboard, READER)]
         else:
             held = {e.identity for e in authority.register.entries if not e.revoked}

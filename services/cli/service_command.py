@@ -16,9 +16,6 @@ SERVICES = {
     "router": "The Zenoh router that all nodes meet at.",
     "camera": "Frames from the sensor, the simulator or a recording.",
     "slam": "The camera's pose for each frame, keyframes and their graph.",
-    "fusion": "Slam's pose with IMU, GPS and a second camera (off by default).",
-    "second_camera": "Frames of a second camera, for fusion.",
-    "second_slam": "The second camera's motion, for fusion.",
     "mapper": "The dense map, submap by submap.",
     "detector": "Trees in the map, by slicing.",
     "refiner": "The target tree in the depth image, at frame rate.",
@@ -28,6 +25,13 @@ SERVICES = {
     "recorder": "Everything worth keeping, into MCAP files.",
     "simulator": "A forest, a camera that sees it, and simulated time.",
 }
+
+OPTIONAL = {
+    "fusion": "Slam's pose with IMU, GPS and a second camera (fusion.enabled).",
+    "second_camera": "Frames of a second camera, for fusion (fusion.second.enabled).",
+    "second_slam": "The second camera's motion, for fusion (fusion.second.enabled).",
+}
+"""Services that run only where the configuration asks for them."""
 
 _MODULES = {
     "refiner": "services.detector.refine.service",

@@ -12,7 +12,7 @@ from services.fusion.config import ImuNoiseConfig
 from services.fusion.values import ImuReading
 
 GRAVITY_M_S2 = 9.80665
-_KEPT = 600
+_KEPT = 1_500
 _AHEAD_NS = 40_000_000
 """The last reading stands for at most so long after it."""
 _GAP_NS = 60_000_000

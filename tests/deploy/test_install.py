@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from schemas.topics import TOPICS
-from services.cli.service_command import SERVICES
+from services.cli.service_command import OPTIONAL, SERVICES
 from services.common.config_loader import load
 from services.common.errors import InputError
 
@@ -43,7 +43,14 @@ def test_the_unit_files_are_the_tables() -> None:
 
 
 def test_there_is_a_unit_for_every_service_and_only_for_those() -> None:
-    assert {unit.name for unit in units.UNITS} == {*SERVICES, "station"} - {"simulator"}
+    assert {unit.name for unit in units.UNITS} == {*SERVICES, *OPTIONAL, "station"} - {"simulator"}
+
+
+def test_what_is_optional_is_not_started_with_the_others() -> None:
+    wanted = units.target_text(ground=False)
+    assert {unit.name for unit in units.UNITS if unit.optional} == set(OPTIONAL)
+    assert all(f"treedock-{name}.service" not in wanted for name in OPTIONAL)
+    assert "treedock-slam.service" in wanted
 
 
 def test_autopilot_and_slam_come_first_when_the_processor_is_short() -> None:
@@ -59,7 +66,9 @@ def test_every_unit_is_supervised_as_decided(unit: units.Unit) -> None:
     for line in ("Type=notify", "WatchdogSec=5", "Restart=always", "RestartSec=500ms", "StartLimitIntervalSec=0",
                  "TimeoutStopSec=3", "User=treedock", "LimitMEMLOCK=infinity", "ProtectSystem=strict"):  # fmt: skip
         assert f"\n{line}\n" in text
-    assert ("DeviceAllow=" in text) == (unit.name in {"camera", "autopilot"}), "devices only where needed"
+    assert ("DeviceAllow=" in text) == (unit.name in {"camera", "second_camera", "autopilot"}), (
+        "devices only where needed"
+    )
     assert ("MemoryDenyWriteExecute" in text) != unit.compiles
 
 
@@ -85,7 +94,12 @@ def imported_by(module: str, seen: set[str]) -> None:
 @pytest.mark.parametrize("unit", units.UNITS, ids=lambda unit: unit.name)
 def test_a_service_with_kernels_may_run_the_code_it_makes_and_no_other_may(unit: units.Unit) -> None:
     """MemoryDenyWriteExecute would end such a service at its first kernel, or leave another less guarded than it could be."""
-    modules = {"refiner": "services.detector.refine.service", "autopilot": "services.navigator.autopilot.service"}
+    modules = {
+        "refiner": "services.detector.refine.service",
+        "autopilot": "services.navigator.autopilot.service",
+        "second_camera": "services.fusion.second_camera",
+        "second_slam": "services.fusion.second_slam",
+    }
     seen: set[str] = set()
     imported_by(modules.get(unit.name, f"services.{unit.name}.service"), seen)
     assert "schemas.topics" in seen
