@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from schemas.topics import TOPICS, Delivery, Topic
+from schemas.topics import ANY, TOPICS, Delivery, Topic
 from services.common.bus import Bus
 from services.common.config import TreedockConfig
 from services.common.context import HealthBook
@@ -123,8 +123,21 @@ def expected() -> set[tuple[str, str, str]]:
     return found | own
 
 
-def test_only_a_station_asks_and_only_the_navigator_answers(folder: Path, port: int) -> None:
-    answers: dict[str, list[str]] = {}
+def asked_of(topic: Topic) -> tuple[set[str], set[str]]:
+    """Who may ask a key, and who may answer: orders by the table's own columns, and kept state of what may be heard."""
+    roles = {name: Identity.parse(name).role for name in NODES}
+    if topic.delivery is Delivery.QUERY:
+        asks = {name for name, role in roles.items() if topic.producer in {role, ANY}}
+        return asks, {name for name, role in roles.items() if role in topic.consumers}
+    asks = {name for name, role in roles.items() if may_subscribe(role, topic)}
+    return asks, {name for name, role in roles.items() if may_publish(role, topic)}
+
+
+def test_every_identity_asks_and_answers_exactly_what_the_table_says(folder: Path, port: int) -> None:
+    """Orders, nonces, the time and all state that is kept: everybody offers answers to every key, and asks for every key."""
+    keys = {t.key("uav1", "hold" if t.name.endswith("*") else None): t
+            for t in TOPICS if t.delivery is Delivery.QUERY or t.rate_hz == 0}  # fmt: skip
+    answers: dict[tuple[str, str], set[str]] = {}
     with contextlib.ExitStack() as stack:
         sessions = {name: stack.enter_context(node(folder, port, name)) for name in NODES}
         for name, session in sessions.items():
@@ -133,14 +146,18 @@ def test_only_a_station_asks_and_only_the_navigator_answers(folder: Path, port: 
                 with query:
                     query.reply(query.key_expr, name)
 
-            session.declare_queryable("treedock/v1/uav1/cmd/hold", answer)
+            for key in keys:
+                session.declare_queryable(key, answer)
         time.sleep(SETTLE_S)
-        for name, session in sessions.items():
-            replies = session.get("treedock/v1/uav1/cmd/hold", timeout=0.5, target=zenoh.QueryTarget.ALL,
-                                  consolidation=zenoh.ConsolidationMode.NONE)  # fmt: skip
-            answers[name] = sorted(r.ok.payload.to_string() for r in replies if r.ok is not None)
-    others = {name: [a for a in got if a != name] for name, got in answers.items()}
-    assert others == {name: ["uav1.navigator"] if name == STATION else [] for name in NODES}
+        for name, session in sessions.items():  # a node's questions at once, and then what came of them
+            coming = {key: session.get(key, timeout=1.0, target=zenoh.QueryTarget.ALL,
+                                       consolidation=zenoh.ConsolidationMode.NONE) for key in keys}  # fmt: skip
+            for key, replies in coming.items():
+                answers[name, key] = {r.ok.payload.to_string() for r in replies if r.ok is not None} - {name}
+    for key, topic in keys.items():
+        asks, gives = asked_of(topic)
+        for name in NODES:
+            assert answers[name, key] == (gives - {name} if name in asks else set()), f"{name} asks {key}"
 
 
 def test_an_advanced_topic_reaches_a_late_joiner_and_tokens_are_seen(folder: Path, port: int) -> None:
