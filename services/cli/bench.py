@@ -33,7 +33,9 @@ def bench(
     data: DataFolder = None,
     scenes: Annotated[str, typer.Option("--scenes", help="Only these scenes, names separated by commas")] = "",
     count: Annotated[int | None, typer.Option("--count", min=1, help="How many runs (missions)")] = None,
-    minutes: Annotated[float | None, typer.Option("--minutes", min=0.5, help="How long (soak)")] = None,
+    minutes: Annotated[
+        float | None, typer.Option("--minutes", min=0.5, help="How long (soak); no further row after (faults)")
+    ] = None,
     rendered: Annotated[
         bool, typer.Option("--rendered", help="With rendered images, real processes (missions)")
     ] = False,

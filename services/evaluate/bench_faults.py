@@ -1,6 +1,7 @@
 """The fault matrix, run: ``treedock bench faults``. Each row is a line in ``faults.jsonl``; a later call goes on from there.
 
-``--scenes NAME,...`` runs only the rows so named (or groups), ``--count`` harms each process so often instead of three times.
+``--scenes NAME,...`` runs only the rows so named (or groups), ``--count`` harms each process so often instead of three times; after
+``--minutes N`` no further row is begun, and what was run before is reported.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ def run(options: BenchOptions) -> BenchReport:
     moments = options.count or (1 if options.quick else 3)
     version = code_version(_CODE)
     path = options.out / "faults.jsonl"
-    found = []
+    found, begun_s = [], time.monotonic()
     with tempfile.TemporaryDirectory(prefix="treedock-faults-") as folder:
         bench = Bench(seed, Path(folder), fresh_seed=options.seed, moments=moments, tell=options.tell)
         try:
@@ -38,6 +39,8 @@ def run(options: BenchOptions) -> BenchReport:
                 key = json.dumps({"row": row.name, "seed": seed, "moments": moments, "code": version})
                 values = _read_results(path).get(key)
                 if values is None:
+                    if options.minutes is not None and time.monotonic() - begun_s > 60.0 * options.minutes:
+                        continue
                     values = run_row(bench, row)
                     _append(path, {"key": key, **values})
                 options.tell(f"{row.name}: {verdict_of(values)}")
