@@ -7,6 +7,7 @@ and the walk goes on after it. The original is kept (``.cut``) when anything but
 from __future__ import annotations
 
 import fcntl
+import os
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -100,18 +101,23 @@ def recover(path: Path) -> Recovered:
     """
     from mcap.writer import CompressionType, Writer
 
+    from services.recorder.chunk_index import keep_small
+
     fresh = path.with_name(f".{path.name}.recovering")
     try:
         with path.open("rb") as stream, fresh.open("wb") as out:
             if stream.read(len(MAGIC)) != MAGIC and path.stat().st_size >= len(MAGIC):
                 raise InputError(f"{path}: no MCAP file: it begins with something else")
             writer = Writer(out, chunk_size=512 * 1024, compression=CompressionType.ZSTD)
+            keep_small(writer)
             writer.start(profile="treedock", library="treedock recovery")
             walk = _Walk(stream)
             copy = _Copy(writer)
             for record in walk.records():
                 copy.take(record)
             writer.finish()
+            out.flush()
+            os.fsync(out.fileno())  # before it takes the place of the only one there is
         if walk.chunks_lost:
             path.replace(path.with_name(path.name + ".cut"))
         fresh.replace(path)

@@ -31,7 +31,7 @@ from services.recorder.config import RecorderConfig
 from services.recorder.drain import Drain, Entry, Limits
 from services.recorder.foxglove import Translator, warm
 from services.recorder.mcap_file import McapFile
-from services.recorder.recover import recover_folder
+from services.recorder.mender import Mender
 from services.recorder.space import free_bytes, tell_space
 
 LOG = logging.getLogger(__name__)
@@ -43,7 +43,7 @@ _RING = 64
 
 
 def build(context: Context) -> RecorderService:
-    """Mend what an earlier recorder left cut, open a file and register the work.
+    """Open a file, register the work, and have what an earlier recorder left cut mended beside it.
 
     Raises:
         InputError: the folder cannot be written.
@@ -51,8 +51,6 @@ def build(context: Context) -> RecorderService:
     config = context.config.recorder
     make_folder(config.folder)
     warm()
-    for mended in recover_folder(config.folder) if config.mcap else ():
-        LOG.info("%s", mended)
     service = RecorderService(context, config)
     for topic in recorded_topics(config):
         leaf = "*" if topic.name.endswith("*") else None
@@ -82,6 +80,7 @@ class RecorderService:
         limits = Limits(config.flush_s, config.file_mb * _MB, config.queue_mb * _MB, config.reserve_mb * _MB)
         self._begun = dt.datetime.now(dt.UTC)
         self.drain = Drain(self._open_file, limits, lambda: free_bytes(config.folder)) if config.mcap else None
+        self._mender = Mender(config.folder, config.reserve_mb) if config.mcap else None
         self._told: dict[str, int] = {}
         self._chronicle = Chronicle(context.uav)
         self._reports, self._reported = 0, False
@@ -110,6 +109,8 @@ class RecorderService:
         if self.drain is None:
             return
         health = self._context.health
+        if self._mender is not None:
+            self._mender.look(health)
         for name, value in sorted(self.drain.counters.items()):
             health.count(name, value - self._told.get(name, 0))
             self._told[name] = value
@@ -118,6 +119,8 @@ class RecorderService:
 
     def stop(self) -> None:
         """Complete the file; tell of a mission that had not ended."""
+        if self._mender is not None:
+            self._mender.stop()
         if self._chronicle.told and not self._reported:
             self._report()
         if self.drain is not None:
