@@ -9,6 +9,7 @@ from schemas.codec import Wire
 from schemas.topics import Topic
 from services.common.clock import Clock
 from services.common.context import Context, HealthBook
+from services.common.errors import InputError
 
 if TYPE_CHECKING:
     from services.common.config import TreedockConfig
@@ -16,6 +17,16 @@ if TYPE_CHECKING:
 M = TypeVar("M", bound=Wire)
 Q = TypeVar("Q", bound=Wire)
 A = TypeVar("A", bound=Wire)
+
+
+def require_second(config: TreedockConfig) -> None:
+    """Check that there is a second camera.
+
+    Raises:
+        InputError: the configuration knows of none.
+    """
+    if not (config.fusion.enabled and config.fusion.second.enabled):
+        raise InputError("there is no second camera: set fusion.enabled=true and fusion.second.enabled=true")
 
 
 class RenamedContext:

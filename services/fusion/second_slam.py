@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from schemas.topics import CAMERA_RGBD, SECOND_POSE, SECOND_RGBD, SLAM_GRAPH, SLAM_KEYFRAME, SLAM_POSE, VEHICLE_STATE
 from services.common.context import Context
-from services.fusion.renamed import RenamedContext
+from services.fusion.renamed import RenamedContext, require_second
 from services.slam.service import SlamService
 from services.slam.service import build as build_slam
 
@@ -14,7 +14,11 @@ def build(context: Context) -> SlamService:
 
     Only the motion from frame to frame is wanted: no loops, nothing on disk. The autopilot's attitude is not listened to:
     slam takes it for that of a camera that looks ahead.
+
+    Raises:
+        InputError: there is no second camera.
     """
+    require_second(context.config)
     slam = context.config.slam.model_copy(update={"frames": "raw", "loop_closing": False, "keep_map": False})
     config = context.config.model_copy(update={"slam": slam})
     names = {

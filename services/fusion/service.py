@@ -11,6 +11,7 @@ from schemas.slam import Pose
 from schemas.topics import FUSION_POSE, FUSION_STATE, SECOND_POSE, SLAM_POSE, VEHICLE_GPS, VEHICLE_IMU
 from schemas.vehicle import GpsFix, ImuSamples
 from services.common.context import Context
+from services.common.errors import InputError
 from services.common.geometry import from_transform, to_transform
 from services.fusion.fuser import Fuser
 from services.fusion.values import Fused, GpsReading, ImuReading, Located
@@ -175,7 +176,15 @@ def _tuple(v: np.ndarray) -> tuple[float, float, float]:
 
 
 def build(context: Context) -> FusionService:
-    """Start fusion on a context."""
+    """Start fusion on a context.
+
+    Raises:
+        InputError: it is switched off, so that nobody would take what it says.
+    """
+    if not context.config.fusion.enabled:
+        raise InputError(
+            "fusion.enabled is false: navigator and autopilot take slam's pose; set fusion.enabled=true for all services"
+        )
     service = FusionService(context)
     service.register()
     return service

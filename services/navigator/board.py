@@ -102,6 +102,13 @@ class Board:
         return self.track.latest if fresh and not self.track.lost else None
 
     @property
+    def carried(self) -> bool:
+        """Whether slam is lost and fusion carries the pose on: good enough to brake by, never to go anywhere."""
+        seen = self.inputs.pose
+        fresh = self.inputs.age_s(seen) <= self.config.failsafe.pose_silent_s
+        return seen is not None and fresh and seen.message.status == "dead_reckoned"
+
+    @property
     def blind_s(self) -> float:
         """Seconds since the last tracked pose came, or since we began to look for one."""
         last = self.track.latest

@@ -138,15 +138,15 @@ def _slam(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
         return Fault(name, response, f"{word}: no pose for {age:.1f} s", f.pose_hold_s, blind=True)
     if b.track.lost:
         word = "slam lost its place" if response == "hold" else f"slam lost its place {blind_s:.1f} s ago: landing"
-        return Fault("slam lost", response, word, f.pose_hold_s, blind=True)
+        return Fault("slam lost", response, word, f.pose_hold_s, blind=not b.carried)
     return None
 
 
 def _who_is_silent(b: Board) -> tuple[str, str]:
     limit = b.config.failsafe.service_silent_s
-    for service in ("slam", "camera"):
+    for service in ("slam", "fusion", "camera"):
         if service in b.inputs.services and b.inputs.service_age_s(service) > limit:
-            return ("service dead" if service == "slam" else "camera silent"), f"{service} is dead or hung"
+            return ("camera silent" if service == "camera" else "service dead"), f"{service} is dead or hung"
     return "camera silent", "camera or slam silent"
 
 
@@ -179,14 +179,16 @@ def _geofence(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
 def _services(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
     del w
     f = b.config.failsafe
-    needed = ["slam"]
+    needed = ["slam", "fusion"]  # the second only where it was ever heard: it is optional
     if doing in _VISUAL:
         needed.append("refiner")
     if doing in _NEEDS_LIST:
         needed += ["mapper", "detector"]
     for name in needed:
         if name in b.inputs.services and b.inputs.service_age_s(name) > f.service_silent_s:
-            return Fault("service dead", "hold", f"{name} is dead or hung", f.service_hold_s, blind=name == "slam")
+            return Fault(
+                "service dead", "hold", f"{name} is dead or hung", f.service_hold_s, blind=name in ("slam", "fusion")
+            )
     return None
 
 

@@ -190,14 +190,15 @@ class Mission:
 
     def _holding(self) -> Intent:
         """Stand still; give way to what comes too near."""
-        b, fault = self.board, self.fault
-        if b.here is None or (fault is not None and fault.blind):
-            return Intent("stop", "freeze")
+        b, fault, here = self.board, self.fault, self.board.here
+        blind = fault is not None and fault.blind
+        if here is None or blind:
+            return Intent("stop", "brake" if b.carried and not blind else "freeze")
         place = self.watch.block.retreat(b) if fault is not None and fault.name == "obstacle" else None
         if place is None:
             return Intent("stop", "brake")
         aim = Aim(at_height(b, place), b.trajectory.yaw_rad, 0.3, 0.0)
-        return Intent("backward", "aim", aim, float(np.linalg.norm(place - b.here.position_m[:2])), "m")
+        return Intent("backward", "aim", aim, float(np.linalg.norm(place - here.position_m[:2])), "m")
 
     def _preflight(self, now_ns: int) -> bool:
         """Return whether the state changed."""

@@ -40,7 +40,7 @@ from services.navigator.values import Inputs, Outputs, Seen
 
 LOG = logging.getLogger(__name__)
 
-WATCHED = ("camera", "slam", "mapper", "detector", "refiner", "autopilot", "station")
+WATCHED = ("camera", "slam", "fusion", "mapper", "detector", "refiner", "autopilot", "station")
 """Services whose health the failsafes look at."""
 _ASKED = (*WATCHED, "router", "recorder", "preview")
 """Services whose word preflight wants."""

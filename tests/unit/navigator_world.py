@@ -157,7 +157,7 @@ class World:
         T = level_camera(self.believed(self.position_m), wrap_angle(self.yaw_rad + self.shift_yaw_rad))
         return Pose(
             stamp_ns=self.now_ns, seq=self._steps, map_id=self.map_id, status=status,
-            T_map_camera=to_transform(T) if status == "tracking" else None, covariance=None,
+            T_map_camera=to_transform(T) if status in ("tracking", "dead_reckoned") else None, covariance=None,
             reset_counter=self.reset_counter, graph_version=0, keyframe_id=None, T_keyframe_camera=None,
             inliers=self.inliers, up_sigma_rad=0.01, processing_ms=10.0,
         )  # fmt: skip
