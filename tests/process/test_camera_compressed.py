@@ -80,6 +80,6 @@ def test_slam_on_another_machine_takes_the_compressed_frames(
     tracked = [pose for pose in poses if pose.status == "tracking"]
     assert len(tracked) > FRAMES // 2, f"{len(poses)} poses, {len(tracked)} tracked"
     assert health.latest["slam"].rates_hz.get(CAMERA_RGBD.name, 0.0) == 0.0, "nothing raw crossed"
-    assert (packed[0].colour_encoding, packed[0].depth_encoding) == ("jpeg", "png")
+    assert (packed[0].colour_encoding, packed[0].depth_encoding) == ("jpeg", "zstd")
     assert set(np.unique(decode_depth_raw(packed[0]))) == {2000}
     assert max(len(frame.to_bytes()) for frame in packed) < 60_000, "a raw frame of this size has 384,000 bytes"
