@@ -126,6 +126,6 @@ def _dock_line(dock: dict[str, Any]) -> str:
         text = "unknown" if believed is None else format(believed, form)
         return text if true is None else f"{text} believed, {format(true, form)} true"
 
-    distance, heading = pair_of("distance_m", ".3f"), pair_of("heading_deg", "+.2f")
+    distance, heading = pair_of("distance_m", ".3f"), pair_of("heading_deg", "+z.2f")
     verdict = "" if dock["good"] else " (outside 0.85..1.00 m or 3 deg, or no suitable tree)"
     return f"docked at tree {dock['tree_id']}: distance {distance} m; heading error {heading} deg{verdict}"

@@ -79,7 +79,7 @@ def fly(case: FlightCase) -> dict[str, Any]:
 
 def line_of(row: Mapping[str, Any]) -> str:
     """Return a flight's row as one line; why, when it is not docked."""
-    where = ", ".join(f"{d:.3f} m {h:+.1f} deg" for d, h in zip(row["distances_m"], row["headings_deg"], strict=True))
+    where = ", ".join(f"{d:.3f} m {h:+z.1f} deg" for d, h in zip(row["distances_m"], row["headings_deg"], strict=True))
     verdict = "docked" if row["docked"] else f"NOT docked ({row['end']}: {row['reason']})"
     holds = f", {len(row['holds'])} holds" if row["holds"] else ""
     return (

@@ -94,7 +94,7 @@ def row_of(seed: int, summary: Mapping[str, Any], exit_code: int) -> dict[str, A
 
 def line_of(row: Mapping[str, Any]) -> str:
     """Return a mission's row as one line; why, when it is not docked."""
-    where = ", ".join(f"{d['true_distance_m']:.3f} m {d['true_heading_deg']:+.1f} deg" for d in _true(row))
+    where = ", ".join(f"{d['true_distance_m']:.3f} m {d['true_heading_deg']:+z.1f} deg" for d in _true(row))
     verdict = "docked" if row["docked"] else f"NOT docked ({row['end']}: {row['reason']})"
     return f"seed {row['seed']}: {verdict} {where}, {row['touches']} touches, {row.get('simulated_s', 0):.0f} s"
 
@@ -124,7 +124,7 @@ def report_of(rows: Sequence[Mapping[str, Any]], first: int, version: str) -> Be
              "| wall (s) | camera (Hz) | holds |", "|---|---|---|---|---|---|---|---|---|---|"]  # fmt: skip
     for row in rows:
         d = _true(row)
-        distance, heading = (f"{d[-1]['true_distance_m']:.3f}", f"{d[-1]['true_heading_deg']:+.2f}") if d else ("", "")
+        distance, heading = (f"{d[-1]['true_distance_m']:.3f}", f"{d[-1]['true_heading_deg']:+z.2f}") if d else ("", "")
         word = "yes" if row["docked"] else f"no: {row['end']}, {row['reason']}"
         lines.append(
             f"| {row['seed']} | {word} | {distance} | {heading} | {row['touches']} | {row.get('clearance_m', 0):.2f} "
