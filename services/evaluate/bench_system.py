@@ -63,7 +63,7 @@ def run(options: BenchOptions) -> BenchReport:
         f"{name} {usage.cpu_cores:.2f} cores" for name, usage in flight.used.items() if name not in flight.aboard
     )
     if (priority := group_priority()) != 0:
-        conditions["priority"] = f"all of it ran before other work on the machine (autogroup nice {priority})"
+        conditions["priority"] = f"all of it ran before other work on the machine (nice {priority})"
     parts = (_summary(figures), _flown(flight), _processes(flight), table_of(ways), _ready(flight, alone))
     return BenchReport(figures, conditions, "\n\n".join(part for part in parts if part))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -71,9 +72,17 @@ def over_budget(used: Mapping[str, Usage], budgets: Mapping[str, Budget]) -> lis
     return found
 
 
+_AUTOGROUPS = Path("/proc/sys/kernel/sched_autogroup_enabled")
+
+
 def group_priority() -> int:
-    """Return the niceness of this session's processes against all others (man sched, autogroups); 0 where there is none."""
+    """Return the niceness of this session's processes against all others (man sched); 0 is the usual.
+
+    With autogroups it is the group's; without them each process has its own, and ours tells.
+    """
     try:
+        if int(_AUTOGROUPS.read_text(encoding="ascii")) == 0:
+            return os.getpriority(os.PRIO_PROCESS, 0)
         return int(Path("/proc/self/autogroup").read_text(encoding="ascii").split()[-1])
     except (OSError, ValueError, IndexError):
         return 0
