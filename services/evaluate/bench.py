@@ -18,6 +18,7 @@ BENCHES: dict[str, str] = {
     "detection": "services.evaluate.bench_detection",
     "mapper": "services.evaluate.bench_mapper",
     "fine": "services.evaluate.bench_fine",
+    "fusion": "services.evaluate.bench_fusion",
     "cameras": "services.evaluate.bench_cameras",
     "peers": "services.evaluate.bench_peers",
     "slam": "services.evaluate.bench_slam",

@@ -226,7 +226,7 @@ class Fuser:
     def _told_at(self, state: State) -> Fused | None:
         s, anchor = self._window()
         if not self._blind and self.gps is not None:
-            self.gps.blind()
+            self.gps.blind(anchor.located.stamp_ns)
         self._blind = True
         s.keep(anchor.index)
         if not self._settle(state, seen=self._carried_by_second(state.stamp_ns)):

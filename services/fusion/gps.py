@@ -25,6 +25,8 @@ _PLACED_NS = 1_000_000_000
 """Without cameras one fix a second is used: those in between share its slow error."""
 _DOUBT = 2.0
 """Its covariance is taken so many times, for the same reason."""
+_BLIND_M, _BLIND_M_S2 = 0.1, 0.05
+"""By how much the IMU alone may have gone astray: as an acceleration does that is 0.1 m/s^2 off (a tilt of half a degree)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +46,13 @@ class GpsDesk:
         self.geo = GeoFilter(config)
         self.jury = Jury(config)
         self.used = self.refused = 0
+        self.caught_ns: list[int] = []
+        """When the receiver was found out, each time that it had been believed."""
         self._waiting: deque[GpsReading] = deque(maxlen=50)
         self._before: deque[tuple[int, GeoState, float]] = deque(maxlen=_SNAPSHOTS)
         self._flown_m = 0.0
         self._last_m: Matrix | None = None
-        self._last_ns = self._placed_ns = -1
+        self._last_ns = self._placed_ns = self._blind_ns = -1
         self._doubted = False
 
     def take(self, fix: GpsReading) -> None:
@@ -81,15 +85,27 @@ class GpsDesk:
             if seen:
                 self._judge(fix, p_W_m, scale)
             elif self._may_place(fix):
-                place, covariance = self.geo.in_world(p_W_m, fix.position_m, scale)
-                out.append(Placement(index, place, _DOUBT * covariance))
-                self._placed_ns = fix.stamp_ns
+                out += self._placed(fix, index, p_W_m, scale)
         return out
 
-    def blind(self) -> None:
+    def blind(self, stamp_ns: int) -> None:
         """End the windows where the cameras end: what comes after is another way."""
         self.jury.forget()
         self._last_m = None
+        self._blind_ns = stamp_ns
+
+    def _placed(self, fix: GpsReading, index: int, p_W_m: Matrix, scale: float) -> list[Placement]:
+        """Return a fix for the smoother, unless it is where the IMU says that the aircraft cannot be."""
+        self._placed_ns = fix.stamp_ns
+        place, covariance = self.geo.in_world(p_W_m, fix.position_m, scale)
+        blind_s = max(0.0, (fix.stamp_ns - self._blind_ns) * 1e-9)
+        y = place - p_W_m
+        doubt = covariance + (_BLIND_M + _BLIND_M_S2 * blind_s**2) ** 2 * np.eye(3)
+        if float(y @ np.linalg.solve(doubt, y)) > self._config.gps_noise.gate:
+            self.refused += 1
+            return []
+        self.used += 1
+        return [Placement(index, place, _DOUBT * covariance)]
 
     def _may_place(self, fix: GpsReading) -> bool:
         known = self.geo.state is not None and self.jury.trusted(fix.stamp_ns)
@@ -117,6 +133,8 @@ class GpsDesk:
         yaw = float(geo.state.x[0])
         since_ns = jury.hear(fix.stamp_ns, p_W_m, fix.position_m, yaw, flown_m=self._flown_m, gated=gated, scale=scale)
         if since_ns is not None:
+            if believed:
+                self.caught_ns.append(fix.stamp_ns)
             self._take_back(since_ns, first=believed)
         elif jury.trusted(fix.stamp_ns) and (not self._before or fix.stamp_ns - self._before[-1][0] >= _SNAPSHOT_NS):
             self._before.append((fix.stamp_ns, geo.state.copy(), self._flown_m))

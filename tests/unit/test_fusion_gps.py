@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from services.common.geometry import Matrix, pose, rotation_z
-from services.fusion.config import FusionConfig
+from services.fusion.config import FusionConfig, GpsConfig
 from services.fusion.fuser import Fuser
 from services.fusion.gps import GpsDesk
 from services.fusion.smoother import State
@@ -17,6 +17,7 @@ from services.fusion.values import GpsReading
 from tests.unit.fusion_motion import FRAME_S, T_BODY_CAMERA, located, reading, stamp_ns, true_body
 
 CONFIG = FusionConfig(gps=True)
+QUICK = GpsConfig(begin_m=1.5, slow_m=0.3, white_m=0.1, delay_s=0.0)
 YAW_RAD, OFFSET_M = 1.1, np.array([3.0, -2.0, 0.5])
 GPS_S = 0.2
 Lie = Callable[[float], Matrix]
@@ -118,6 +119,29 @@ def test_silence_is_told_and_what_comes_after_it_is_used() -> None:
     walk = Walk(2).go(90.0, silent=(50.0, 60.0))
     assert not walk.trusted[round(58.0 / GPS_S)]
     assert walk.trusted[-1]
+
+
+def test_a_lie_told_in_the_dark_does_not_carry_the_pose_away() -> None:
+    """The receiver jumps by 10 m while no camera sees; the IMU carries the pose for three seconds."""
+    carried = []
+    for gps in (False, True):
+        config = CONFIG.model_copy(update={"gps": gps, "imu_alone_s": 3.0, "sigma_m": 5.0, "gps_noise": QUICK})
+        fuser, rng, frames, told = Fuser(config, T_BODY_CAMERA), np.random.default_rng(7), 0, []
+        for k in range(-25, 1060):
+            t_s = k * 0.008
+            fuser.imu(reading(t_s, 0.008, rng, bias=0.05))
+            if k % 25 == 0:
+                fuser.fix(GpsReading(stamp_ns(t_s), true_body(t_s)[:3, 3] + jump(6.4)(t_s), 0.3))
+            if t_s >= frames * FRAME_S:
+                at_s, frames = frames * FRAME_S, frames + 1
+                place = located(at_s, rng)
+                fused = fuser.camera(stamp_ns(at_s), None if at_s > 6.0 else place)
+                told += [fused] if fused is not None and fused.carrier == "imu" else []
+        carried.append(told)
+        assert fuser.gps is None or fuser.gps.geo.state is not None
+    assert len(carried[0]) == len(carried[1]) > 25
+    apart = [np.linalg.norm((a.T_map_camera - b.T_map_camera)[:3, 3]) for a, b in zip(*carried, strict=True)]
+    assert max(apart) < 0.3
 
 
 def test_no_gps_moves_a_pose_in_the_map() -> None:
