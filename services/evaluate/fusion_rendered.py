@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from services.common.geometry import Matrix, pose, rotation_z
+from services.common.geometry import Matrix
 from services.evaluate.fusion_flight import FRAME_HZ, FlownWay
 from services.evaluate.slam_walk import CIRCUIT_M, HEIGHT_M, walk_scene
 from services.fusion.values import Located
@@ -122,21 +123,37 @@ class _Slam:
 
 
 def see(flown: FlownWay, seed: int, kept: Path, progress: Callable[[str], None]) -> dict[str, Seen]:
-    """Return what slam tells of a flight: by fault for the first camera, ``second`` for the other; kept in a file."""
-    names = (*FAULTS, "second")
-    if kept.exists():
-        with np.load(kept) as data:
-            return {n: Seen(data[f"{n} T"], data[f"{n} C"], data[f"{n} epoch"]) for n in names}
-    out = _rendered(flown, seed, FIRST, list(FAULTS), lambda text: progress(f"first camera: {text}"))
-    out |= _rendered(flown, seed, SECOND, [None], lambda text: progress(f"second camera: {text}"))
-    arrays: dict[str, NDArray[Any]] = {}
-    for name, seen in out.items():
-        arrays |= {f"{name} T": seen.T_map_camera, f"{name} C": seen.covariance, f"{name} epoch": seen.epoch}
-    kept.parent.mkdir(parents=True, exist_ok=True)
-    partial = kept.with_suffix(".partial.npz")
-    np.savez_compressed(partial, allow_pickle=False, **arrays)
-    partial.rename(kept)
+    """Return what slam tells of a flight: by fault for the first camera, ``second`` for the other.
+
+    Each camera's part is kept in a file of its own below ``kept``, so that an interrupted call loses one at most.
+    """
+    kept.mkdir(parents=True, exist_ok=True)
+    out: dict[str, Seen] = {}
+    cameras: tuple[tuple[str, Matrix, list[str | None]], ...] = (
+        ("first", FIRST, list(FAULTS)),
+        ("second", SECOND, [None]),
+    )
+    for name, mount, faults in cameras:
+        path = kept / f"{name}.npz"
+        if not path.exists():
+            _keep(path, _rendered(flown, seed, mount, faults, partial(_told, progress, name)))
+        with np.load(path) as data:
+            keys = [fault or "second" for fault in faults]
+            out |= {n: Seen(data[f"{n} T"], data[f"{n} C"], data[f"{n} epoch"]) for n in keys}
     return out
+
+
+def _told(progress: Callable[[str], None], camera: str, text: str) -> None:
+    progress(f"{camera} camera: {text}")
+
+
+def _keep(path: Path, told: dict[str, Seen]) -> None:
+    arrays: dict[str, NDArray[Any]] = {}
+    for name, seen in told.items():
+        arrays |= {f"{name} T": seen.T_map_camera, f"{name} C": seen.covariance, f"{name} epoch": seen.epoch}
+    half = path.with_suffix(".half.npz")
+    np.savez_compressed(half, allow_pickle=False, **arrays)
+    half.rename(path)
 
 
 def _rendered(
@@ -160,10 +177,3 @@ def _rendered(
         if index % 60 == 0:
             progress(f"frame {index} of {len(flown.frames)}")
     return {name: slam.seen() for name, slam in slams.items()}
-
-
-def from_world(frame_T_world_body: Matrix) -> Matrix:
-    """Return the level frame of a flight's start: ``T_world_start``, heading as flown."""
-    T = frame_T_world_body @ FIRST
-    forward = T[:3, 2]
-    return pose(rotation_z(float(np.arctan2(forward[1], forward[0]))), T[:3, 3])

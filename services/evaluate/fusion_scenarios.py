@@ -97,7 +97,7 @@ def make(scenario: Scenario, seed: int, kept: Path, tell: Callable[[str], None])
     """Fly a scenario; rendered ones are located by the real slam, which takes minutes the first time."""
     if scenario.fault:
         flown = fly(circle(walk_scene(seed)), scenario.seconds, seed, scenario.wind, scenario.gps)
-        seen = see(flown, seed, kept / f"seen-{seed}-{code_version(_RENDERED_CODE)}.npz", tell)
+        seen = see(flown, seed, kept / f"seen-{seed}-{code_version(_RENDERED_CODE)}", tell)
         first = seen[scenario.fault].located(flown)
         return Flight(flown, first, seen["second"].located(flown), _alignment(flown, first))
     way: Way = oval
