@@ -19,8 +19,10 @@ from schemas.simulation import SimClock
 from schemas.slam import Pose
 from schemas.topics import (
     MISSION_GUIDANCE,
+    SECOND_POSE,
     SIM_CLOCK,
     SIM_RGBD,
+    SIM_SECOND,
     SIM_TRUTH,
     SLAM_POSE,
     TREES_TARGET,
@@ -30,6 +32,7 @@ from schemas.trees import Target
 from schemas.vehicle import VehicleState
 from services.common.context import Context
 from services.common.geometry import pose, rotation_z
+from services.navigator.autopilot.frames import Mount
 from services.simulator.config import SimulatorConfig
 from services.simulator.followers import Follower, Followers
 from services.simulator.path import START_STAMP_NS
@@ -45,6 +48,7 @@ _TURN_S = 0.002
 _MOST_CREDIT_S = 0.08
 _SEES = ("slam", "refiner")
 _STEERS = ("autopilot", "navigator")
+_SECOND = "second_slam"
 _FLOWN_M = 0.5
 _LANDING = frozenset({NavState.LAND, NavState.DESCEND, NavState.RETURN})
 
@@ -66,16 +70,22 @@ class Flight:
         px4: SimulatedPx4 | None = None,
     ) -> None:  # fmt: skip
         self._context, self._config, self._wall = context, config, wall
-        self.stage = Stage(config)
+        second = context.config.fusion.second
+        self._two_cameras = context.config.fusion.enabled and second.enabled
+        self.stage = Stage(config, second=self._two_cameras)
         warm()
         self.px4 = px4 or simulated_px4(self.stage.scene, config)
         if px4 is None:
             self.px4.open_links()
             context.on_stop(self.px4.close)
         self.camera = FlyingCamera(self.px4, context.config.autopilot.camera_offset_m)
+        self._T_body_second = Mount.level(second.offset_m, second.pitch_rad, second.yaw_rad).T_body_camera
         self.stage.begin_map(self.camera.pose())
         seen = Follower("slam", ("camera",)), Follower("refiner", ("camera", "slam"))
-        self._followers = Followers([*seen, *map(Follower, _STEERS)], context.alive, config.flight.hung_after_s)
+        below = [Follower(_SECOND, ("second_camera",))] if self._two_cameras else []
+        self._sees = (*_SEES, *(follower.name for follower in below))
+        followers = [*seen, *below, *map(Follower, _STEERS)]
+        self._followers = Followers(followers, context.alive, config.flight.hung_after_s)
         self.phase: Phase = "waiting"
         self.frames = 0
         self._ticks = 0
@@ -85,7 +95,7 @@ class Flight:
         self._due_ns = float(START_STAMP_NS)
         self._lottery = np.random.default_rng([config.seed, 303])
         self._dropped = False
-        self._rendered: tuple[RgbdFrame, Floats] | None = None
+        self._rendered: tuple[RgbdFrame, Floats, RgbdFrame | None] | None = None
         self._credit_s, self._earned_at_s = 0.0, wall()
         self._listen()
 
@@ -93,6 +103,8 @@ class Flight:
         c = self._context
         c.on(SLAM_POSE, self._on_pose)
         c.on(TREES_TARGET, self._on_target)
+        if self._two_cameras:
+            c.on(SECOND_POSE, self._on_second)
         c.on(MISSION_GUIDANCE, self._on_guidance)
         c.on(VEHICLE_STATE, self._on_vehicle)
         c.every_wall(_TURN_S, self.turn)
@@ -100,6 +112,9 @@ class Flight:
 
     def _on_pose(self, message: Pose) -> None:
         self._followers.answered("slam", message.stamp_ns)
+
+    def _on_second(self, message: Pose) -> None:
+        self._followers.answered(_SECOND, message.stamp_ns)
 
     def _on_target(self, message: Target) -> None:
         self._followers.answered("refiner", message.stamp_ns)
@@ -130,7 +145,7 @@ class Flight:
             self._rendered, self._dropped = None, self._drops()
             self._due_ns += 1e9 / self._config.rate_hz
         elif self._rendered is not None:
-            if not self._followers.waits(_SEES, self._frame_ns, now_s):
+            if not self._followers.waits(self._sees, self._frame_ns, now_s):
                 self._send(*self._rendered)
         elif self._credit_s > 0.0 and not self._ahead(now_s):
             self._step()
@@ -178,18 +193,22 @@ class Flight:
         self._context.publish(SIM_CLOCK, clock)
 
     # -- frames -------------------------------------------------------------------------------------------------
-    def _render(self) -> tuple[RgbdFrame, Floats]:
-        """Return the frame of this moment."""
-        T_world_camera = self.camera.pose()
+    def _render(self) -> tuple[RgbdFrame, Floats, RgbdFrame | None]:
+        """Return the frame of this moment, and the second camera's if there is one."""
+        T_world_camera, felt = self.camera.pose(), self.camera.acceleration()
+        T_world_second = self.px4.true_pose() @ self._T_body_second
         with self._context.health.timed("render"):
-            frame = self.stage.frame(T_world_camera, self.camera.acceleration(), self.frames, self.now_ns)
-        return frame, T_world_camera
+            frame = self.stage.frame(T_world_camera, felt, self.frames, self.now_ns)
+            second = self.stage.second_frame(T_world_second, felt, self.frames, self.now_ns)
+        return frame, T_world_camera, second
 
-    def _send(self, frame: RgbdFrame, T_world_camera: Floats) -> None:
+    def _send(self, frame: RgbdFrame, T_world_camera: Floats, second: RgbdFrame | None) -> None:
         """Publish a frame with its truth; the flight has begun once somebody answers frames."""
         self._rendered, self._frame_ns, self._dropped = None, frame.stamp_ns, self._drops()
         self._context.publish(SIM_TRUTH, self.stage.truth(T_world_camera, frame.seq, frame.stamp_ns))
         self._context.publish(SIM_RGBD, frame)
+        if second is not None:
+            self._context.publish(SIM_SECOND, second)
         self.frames += 1
         self._context.health.count("frames")
         self._due_ns += 1e9 / self._config.rate_hz

@@ -17,6 +17,7 @@ from services.simulator.touch import Touches
 from services.simulator.truth import fair_trees, truth_trees
 from services.simulator.world import World
 
+_SECOND_SEED = 5_000
 _ACCEL_READINGS = 6
 """Readings per frame; the frame carries their mean."""
 
@@ -24,7 +25,7 @@ _ACCEL_READINGS = 6
 class Stage:
     """A world seen by a camera. Frames and truths are made of true poses, ``T_world_camera`` (4, 4)."""
 
-    def __init__(self, config: SimulatorConfig) -> None:
+    def __init__(self, config: SimulatorConfig, *, second: bool = False) -> None:
         scene = scene_for(config.scene, config.seed, config.trees)
         self.scene = scene
         self.world = World(scene)
@@ -33,6 +34,11 @@ class Stage:
         self.touches = Touches(config.body_radius_m)
         self._camera = SimulatedCamera(self.world, config.sensor, config.reduced, config.seed, config.small)
         self._accelerometer = Accelerometer(config.sensor, config.seed)
+        other_seed = config.seed + _SECOND_SEED
+        self._second = (
+            SimulatedCamera(self.world, config.sensor, config.reduced, other_seed, config.small) if second else None
+        )
+        self._second_accelerometer = Accelerometer(config.sensor, other_seed)
         self._T_map_world = np.eye(4)
         self._fair = fair_trees(self.world, self.path)
         self.begin_map(self.path.at(0.0))
@@ -46,12 +52,13 @@ class Stage:
 
     def frame(self, T_world_camera: Floats, acceleration: Floats, seq: int, stamp_ns: int) -> RgbdFrame:
         """Return what the camera sees; ``acceleration`` in the world, m/s^2 (3,), gravity not included."""
-        images = self._camera.look(T_world_camera, seq)
-        return RgbdFrame(
-            stamp_ns=stamp_ns, seq=seq, intrinsics=self._camera.intrinsics, colour=images.colour.data.cast("B"),
-            depth=images.depth.data.cast("B"), render_scale=self._camera.render_scale,
-            accel_camera=self._accelerate(T_world_camera, acceleration),
-        )  # fmt: skip
+        return _frame(self._camera, self._accelerometer, T_world_camera, acceleration, seq, stamp_ns)
+
+    def second_frame(self, T_world_camera: Floats, acceleration: Floats, seq: int, stamp_ns: int) -> RgbdFrame | None:
+        """Return what the second camera sees at its own pose, None without one."""
+        if self._second is None:
+            return None
+        return _frame(self._second, self._second_accelerometer, T_world_camera, acceleration, seq, stamp_ns)
 
     def truth(self, T_world_camera: Floats, seq: int, stamp_ns: int) -> SimTruth:
         """Return the truth at a pose."""
@@ -61,7 +68,15 @@ class Stage:
             touched=self.touches.count, clearance_m=min(self.touches.smallest_m, 1e3),
         )  # fmt: skip
 
-    def _accelerate(self, T_world_camera: Floats, acceleration: Floats) -> tuple[float, float, float]:
-        readings = [self._accelerometer.measure(T_world_camera[:3, :3], acceleration) for _ in range(_ACCEL_READINGS)]
-        x, y, z = (float(value) for value in np.mean(readings, axis=0))
-        return x, y, z
+
+def _frame(
+    camera: SimulatedCamera, accelerometer: Accelerometer, T_world_camera: Floats, acceleration: Floats, seq: int,
+    stamp_ns: int,
+) -> RgbdFrame:  # fmt: skip
+    images = camera.look(T_world_camera, seq)
+    readings = [accelerometer.measure(T_world_camera[:3, :3], acceleration) for _ in range(_ACCEL_READINGS)]
+    x, y, z = (float(value) for value in np.mean(readings, axis=0))
+    return RgbdFrame(
+        stamp_ns=stamp_ns, seq=seq, intrinsics=camera.intrinsics, colour=images.colour.data.cast("B"),
+        depth=images.depth.data.cast("B"), render_scale=camera.render_scale, accel_camera=(x, y, z),
+    )  # fmt: skip

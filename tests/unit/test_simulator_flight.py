@@ -15,8 +15,10 @@ from schemas.simulation import SimClock, SimTruth
 from schemas.slam import Pose
 from schemas.topics import (
     MISSION_GUIDANCE,
+    SECOND_POSE,
     SIM_CLOCK,
     SIM_RGBD,
+    SIM_SECOND,
     SIM_TRUTH,
     SLAM_POSE,
     TREES_TARGET,
@@ -28,6 +30,7 @@ from services.common.config import TreedockConfig
 from services.common.context import Context
 from services.common.geometry import level_camera
 from services.common.memory import Hub
+from services.fusion.config import FusionConfig, SecondCameraConfig
 from services.simulator.camera import SimulatedCamera
 from services.simulator.catalogue import scene_by_name
 from services.simulator.config import FlightConfig, SensorConfig, SimulatorConfig
@@ -133,8 +136,8 @@ CONFIG = SimulatorConfig(
 class Bench:
     """The flying simulator on the bus in memory, with stand-ins that answer at once."""
 
-    def __init__(self, config: SimulatorConfig = CONFIG) -> None:
-        self.hub = Hub(TreedockConfig())
+    def __init__(self, config: SimulatorConfig = CONFIG, tree: TreedockConfig | None = None) -> None:
+        self.hub = Hub(tree or TreedockConfig())
         self.now_s = 0.0
         self.context = self.hub.context("simulator")
         self.others = self.hub.context("others")
@@ -191,6 +194,37 @@ def bench() -> Bench:
     made = Bench()
     made.live("camera", "slam", "mapper", "detector", "refiner", "navigator", "autopilot")
     return made
+
+
+def test_a_second_camera_looks_down_at_the_same_moment_and_is_waited_for() -> None:
+    fusion = FusionConfig(enabled=True, second=SecondCameraConfig(enabled=True))
+    config = CONFIG.model_copy(update={"sensor": SensorConfig(disparity_sigma_px=0.0, min_range_m=0.01)})
+    made = Bench(config, TreedockConfig(fusion=fusion))
+    made.live("camera", "slam", "mapper", "detector", "refiner", "navigator", "autopilot")
+    second: list[RgbdFrame] = []
+    made.others.on(SIM_SECOND, second.append)
+    made.turns(1.0)
+    assert [(f.stamp_ns, f.seq) for f in second] == [(f.stamp_ns, f.seq) for f in made.frames]
+    depth = np.frombuffer(second[-1].depth, np.uint16).reshape(480, 640) / second[-1].intrinsics.depth_scale
+    assert 0.02 < float(np.median(depth[200:280, 280:360])) < 0.12, (
+        "it hangs 5 cm below a body that stands on 10 cm of legs"
+    )
+    made.live("second_camera", "second_slam")
+    pose = {"map_id": "m", "status": "lost", "reset_counter": 0, "graph_version": 0, "inliers": 0, "up_sigma_rad": 0.0,
+            "processing_ms": 1.0, "stamp_ns": second[-1].stamp_ns, "seq": 1}  # fmt: skip
+    made.others.publish(SECOND_POSE, Pose.model_validate(dict.fromkeys(Pose.model_fields) | pose))
+    made.turns(0.5)
+    before = len(made.frames)
+    made.turns(0.5)
+    assert len(made.frames) <= before + 1, "its slam has not answered: time stands still"
+
+
+def test_without_fusion_there_is_no_second_camera(bench: Bench) -> None:
+    second: list[RgbdFrame] = []
+    bench.others.on(SIM_SECOND, second.append)
+    bench.turns(0.5)
+    assert bench.frames
+    assert not second
 
 
 def test_time_begins_when_the_chain_lives_and_ends_at_the_limit(bench: Bench) -> None:
