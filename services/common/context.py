@@ -119,3 +119,13 @@ class Context(Protocol):
     ) -> list[A]:
         """Query a key and return the decoded replies; empty when nobody answered in time."""
         ...
+
+    def ask_later(
+        self, topic: Topic, request: Wire, kind: type[A], timeout_s: float, then: Callable[[list[A]], None]
+    ) -> None:
+        """Query a key without waiting: the work loop calls ``then`` with the replies, or with none after ``timeout_s``."""
+        ...
+
+    def steady_ns(self) -> int:
+        """Return a time that nobody sets and that goes on while the machine sleeps: for durations that others rely on."""
+        ...

@@ -142,3 +142,13 @@ class MemoryContext:
         handler = self._hub._answers.get(key)  # noqa: SLF001
         reply = handler(request) if handler else None
         return [reply] if isinstance(reply, kind) else []
+
+    def ask_later(
+        self, topic: Topic, request: Wire, kind: type[A], timeout_s: float, then: Callable[[list[A]], None]
+    ) -> None:
+        """Ask and answer at once."""
+        then(self.ask(topic, request, kind, timeout_s))
+
+    def steady_ns(self) -> int:
+        """Return the hub's time: there is no other."""
+        return self.clock.now_ns()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import datetime as dt
 import heapq
 import logging
+import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -20,6 +21,7 @@ from schemas.envelope import DecodeError
 from schemas.simulation import SimClock
 from schemas.topics import HEALTH, SIM_CLOCK, TOPICS, Topic
 from services.common import sd_notify
+from services.common.asking import Asking
 from services.common.bus import Bus
 from services.common.clock import Clock, SimulatedClock, WallClock
 from services.common.clock_sync import ClockSync
@@ -84,6 +86,7 @@ class LiveContext:
         self._stepped_ns = 0
         """By how much the wall clock stepped since the timers were set."""
         self._throttle = Throttle()
+        self._asking: Asking | None = None
 
     def on(
         self, topic: Topic, handler: Callable[[M], None], leaf: str | None = None, *, ring: int | None = None
@@ -133,6 +136,19 @@ class LiveContext:
     ) -> list[A]:
         """Query a key."""
         return self.bus.ask(topic, request, kind, timeout_s, leaf)
+
+    def ask_later(
+        self, topic: Topic, request: Wire, kind: type[A], timeout_s: float, then: Callable[[list[A]], None]
+    ) -> None:
+        """Query a key on a thread of its own; ``then`` is called by the work loop."""
+        if self._asking is None:
+            self._asking = Asking(self.bus, self.inbox)
+            self.at_stop.append(self._asking.close)
+        self._asking.ask(topic, request, kind, timeout_s, then)
+
+    def steady_ns(self) -> int:
+        """Return the time since the machine started, its sleep included."""
+        return time.clock_gettime_ns(time.CLOCK_BOOTTIME) if hasattr(time, "CLOCK_BOOTTIME") else time.monotonic_ns()
 
     def guarded(self, about: str, handler: Callable[[M], None]) -> Callable[[M], None]:
         """Return ``handler`` so that bad data is counted and told; any other exception is a bug and passes."""

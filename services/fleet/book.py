@@ -86,15 +86,15 @@ class Book:
             self.leases.pop((uav, request.lease_id), None)
             return self._reply(request, 0.0, "released")
         if isinstance(way, str):
-            return self._reply(request, None, way, final=True)
+            return self._reply(request, None, way)
         if request.kind == "done":
             return self._take_done(uav, request, way)
         if request.kind == "renew" and own is None:
             return self._reply(request, None, "this claim is not known here: it ran out, or was released", final=True)
-        if way.sigma_m > self.rules.max_sigma_m:
-            return self._reply(request, None, _vague(uav, way.sigma_m, self.rules.max_sigma_m), final=True)
         if own is not None:
             return self._renew(own, request, way, now_ns)
+        if request.goal.kind == "tree" and way.sigma_m > self.rules.max_sigma_m:
+            return self._reply(request, None, _vague(uav, way.sigma_m, self.rules.max_sigma_m))
         return self._claim(uav, request, way, now_ns)
 
     def forget_done(self, near: Vec2 | None = None, within_m: float = 0.0) -> int:
@@ -177,8 +177,8 @@ class Book:
     def _who(self, held: Lease, way: Stretch) -> str:
         if held.kind == "tree" and math.dist(held.way.to_m, way.to_m) < self.rules.same_tree_m + held.way.doubt_m(way):
             return f"{held.uav} holds this tree"
-        what = {"tree": "its way to a tree", "place": "its starting place", "way": "its way home"}[held.kind]
-        return f"{held.uav} is too near: {what} comes within {held.way.gap_m(way):.1f} m"
+        what = {"tree": "its way to a tree passes", "place": "it stands", "way": "its way home passes"}[held.kind]
+        return f"{held.uav} is too near: {what} here"
 
     # -- keeping
 

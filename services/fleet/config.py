@@ -12,7 +12,7 @@ class FleetConfig(BaseModel):
 
     enabled: bool = False
     """Answer the claims of aircraft; they need ``navigator.claims.enabled`` to ask."""
-    lease_s: float = Field(default=30.0, ge=2.0, le=600.0)
+    lease_s: float = Field(default=40.0, ge=2.0, le=600.0)
     """How long a claim holds without a word from the aircraft; also how long an arbiter without its book waits."""
     separation_m: float = Field(default=3.0, gt=0.0)
     """No two claims of different aircraft come nearer: each may stand 0.95 m from its trunk on either side, is 0.35 m
@@ -20,7 +20,7 @@ class FleetConfig(BaseModel):
     same_tree_m: float = Field(default=0.5, gt=0.0)
     """A tree this near to a visited one (and twice the doubt of both places) is that tree."""
     max_sigma_m: float = Field(default=0.5, gt=0.0)
-    """A place known worse than this is refused: nobody could tell which tree is meant."""
+    """A tree whose place is known worse than this is refused: nobody could tell which one is meant."""
     book: str = ""
     """File that leases and visited trees are kept in; empty: fleet.json beside the inventory's usual file."""
 
@@ -39,11 +39,11 @@ class ClaimConfig(BaseModel):
     ask_timeout_s: float = Field(default=0.9, gt=0.0)
     again_s: float = Field(default=3.0, gt=0.0)
     """A tree that another holds is asked for again after this."""
-    reserve_s: float = Field(default=15.0, gt=0.0)
+    reserve_s: float = Field(default=18.0, gt=0.0)
     """With less than this left the aircraft holds: so much is needed to hold, back off and land while still alone."""
     hold_s: float = Field(default=5.0, gt=0.0)
     """Then, without a renewal, it backs off and lands."""
-    wait_s: float = Field(default=120.0, gt=0.0)
+    wait_s: float = Field(default=90.0, gt=0.0)
     """How long to wait for trees that others hold, or for a free way home, before giving up."""
 
     @model_validator(mode="after")

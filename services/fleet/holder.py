@@ -34,12 +34,44 @@ class Held:
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """What the arbiter said, and when."""
+    """What the arbiter said."""
 
     goal: ClaimGoal
     reason: str
     final: bool
-    at_ns: int
+    number: int
+    """Rises with every refusal: an old one is not taken for a new one."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClaimView:
+    """What the mission is told of its claims at one step."""
+
+    held: ClaimGoal | None = None
+    left_s: float = 0.0
+    broken: str = ""
+    """Why the held lease will not get longer."""
+    refusal: Refusal | None = None
+    note: str = ""
+    undelivered: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What the mission wants of its claims at one step."""
+
+    goal: ClaimGoal | None = None
+    """To be claimed beside what is held; None: nothing more than that."""
+    again: bool = False
+    heard: int = 0
+    """Number of the last refusal that this wish was made with."""
+    done: bool = False
+    release: bool = False
+    at_m: tuple[float, float] | None = None
+    """Where the aircraft is, in ``map_id``."""
+    to_m: tuple[float, float] | None = None
+    """Where the held goal stands by the present map."""
+    map_id: str = ""
 
 
 @dataclass
@@ -54,11 +86,37 @@ class Holder:
     """Of the last claim asked for."""
     arbiter: str = ""
     note: str = ""
+    _refusals: int = 0
     _done: dict[int, ClaimRequest] = field(default_factory=dict)
     _give_back: dict[int, ClaimRequest] = field(default_factory=dict)
     _due_ns: dict[tuple[ClaimKind, int], int] = field(default_factory=dict)
 
     # -- what the mission wants
+
+    def follow(self, wish: Wish) -> None:
+        """Do what a step of the mission wants."""
+        if wish.at_m is not None:
+            self.at(wish.at_m, wish.to_m, wish.map_id)
+        if wish.done:
+            self.done()
+        if wish.release:
+            self.release()
+        elif wish.goal is not None and not self._unheard(wish):
+            self.claim(wish.goal, again=wish.again)
+        elif wish.goal is None:
+            self.withdraw()
+
+    def _unheard(self, wish: Wish) -> bool:
+        """Whether a refusal came that the mission has not seen yet: it must not be asked over."""
+        r = self.refusal
+        return r is not None and wish.goal is not None and r.number > wish.heard and same_goal(r.goal, wish.goal)
+
+    def view(self, now_ns: int) -> ClaimView:
+        """Return what the mission is to know at ``now_ns``."""
+        left_s, held = self.left_s(now_ns), self.held
+        if held is None or left_s <= 0.0:
+            return ClaimView(refusal=self.refusal, note=self.note, undelivered=self.undelivered)
+        return ClaimView(held.goal, left_s, held.refused, self.refusal, self.note, self.undelivered)
 
     def claim(self, goal: ClaimGoal, *, again: bool = False) -> None:
         """Ask for ``goal`` until it is granted or refused; another one that was asked for is withdrawn."""
@@ -144,7 +202,7 @@ class Holder:
         goal = self.asked.goal
         self.asked = None
         if not reply.granted:
-            self.refusal, self.note = Refusal(goal, reply.reason, reply.final, now_ns), reply.reason
+            self.refusal, self.note = self._refused(goal, reply), reply.reason
             self._return(reply.lease_id, goal)  # an earlier asking of the same may have been granted, its answer lost
             return
         until_ns = self._until_ns(asked.sent_ns, reply.lease_s)
@@ -155,6 +213,10 @@ class Holder:
             self._return(self.held.lease_id, self.held.goal)
         self.held, self.note = Held(reply.lease_id, goal, until_ns), ""
         self._due_ns["renew", reply.lease_id] = now_ns + _ns(self.config.renew_s)
+
+    def _refused(self, goal: ClaimGoal, reply: ClaimReply) -> Refusal:
+        self._refusals += 1
+        return Refusal(goal, reply.reason, reply.final, self._refusals)
 
     def _on_renew(self, asked: Asked, reply: ClaimReply, now_ns: int) -> None:
         held = self.held

@@ -14,18 +14,7 @@ from schemas.fleet import ClaimGoal, Vec2
 from services.fleet.shapes import Stretch
 from services.inventory.config import StartPoint
 from services.inventory.geodesy import TangentPlane, place_of_start
-from services.inventory.values import Rigid2
-
-
-@dataclass(frozen=True, slots=True)
-class Laid:
-    """Where the inventory has laid a map: its place in the plane of a site, and how well that is known."""
-
-    place: Rigid2
-    site_deg: tuple[float, float, float]
-    """Latitude, longitude, altitude of the site's plane."""
-    sigma_m: float
-    sigma_heading_rad: float
+from services.inventory.values import Laid
 
 
 @dataclass(frozen=True, slots=True)

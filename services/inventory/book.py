@@ -8,6 +8,7 @@ once the pattern of their trees says how one lies on the other; until then each 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from schemas.trees import Tree, TreeList
 from services.inventory.config import InventoryConfig, StartPoint
@@ -20,6 +21,7 @@ from services.inventory.values import (
     Contents,
     Flight,
     InventoryTree,
+    Laid,
     Measurement,
     Rigid2,
     Sighting,
@@ -134,6 +136,28 @@ class Inventory:
         assert site.frame == frame
         self.sites[number] = self.changes.sites[number] = site
         return site
+
+    def laid(self) -> dict[tuple[str, str], Laid]:
+        """Return where the newest flight of each aircraft and map lies on the earth, for those that do.
+
+        Flights laid on each other share the doubt of the site's first start point, which does not part them; one that
+        only its own start point places has both doubts.
+        """
+        found: dict[tuple[str, str], Laid] = {}
+        first = {f.site: f for f in sorted(self.flights.values(), key=lambda f: -f.fid) if f.frame == "global"}
+        for flight in sorted(self.flights.values(), key=lambda f: f.run):
+            site = self.sites[flight.site]
+            if site.frame != "global":
+                continue
+            sigma_m, heading = flight.sigma_m, flight.sigma_heading_rad
+            if flight is first[flight.site]:
+                sigma_m = heading = 0.0
+            elif not flight.aligned:
+                sigma_m = math.hypot(sigma_m, first[flight.site].sigma_m)
+                heading = math.hypot(heading, first[flight.site].sigma_heading_rad)
+            at = (site.latitude_deg, site.longitude_deg, site.altitude_m)
+            found[flight.uav, flight.map_id] = Laid(replace(flight.place), at, sigma_m, heading)
+        return found
 
     # -- trees
 

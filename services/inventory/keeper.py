@@ -47,6 +47,8 @@ class Keeper:
         self._config = config
         self._tell = tell
         self.inventory = Inventory(config, store.load())
+        self.laid = self.inventory.laid()
+        """Where maps lie on the earth: made anew, never changed, so that any thread may read it."""
         self.commits = 0
         self.commit_ms = 0.0
         """The slowest commit so far."""
@@ -110,6 +112,7 @@ class Keeper:
         if self._waiting:
             self._commit()
         self.inventory.join_next(now_ns)  # after the commit, and one at a time: no list waits for it
+        self.laid = self.inventory.laid()
 
     def _commit(self) -> None:
         begin_s = time.monotonic()

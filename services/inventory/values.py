@@ -67,6 +67,17 @@ class Flight:
     note: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class Laid:
+    """Where a flight's map lies on the earth: its place in the plane of its site, and how well that is known."""
+
+    place: Rigid2
+    site_deg: tuple[float, float, float]
+    """Latitude, longitude, altitude of the site's plane."""
+    sigma_m: float
+    sigma_heading_rad: float
+
+
 @dataclass(slots=True)
 class Sighting:
     """A tree of one flight and the inventory's tree that it is."""

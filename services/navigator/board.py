@@ -9,6 +9,7 @@ import numpy as np
 from schemas.trees import Target, Tree
 from schemas.vehicle import VehicleState
 from services.common.geometry import Matrix, wrap_angle
+from services.navigator.claiming import Claims
 from services.navigator.config import NavigatorConfig
 from services.navigator.docking import DockMonitor
 from services.navigator.following import Following
@@ -34,6 +35,7 @@ class Board:
     track: PoseTrack = field(init=False)
     trajectory: Trajectory = field(init=False)
     dock: DockMonitor = field(init=False)
+    claims: Claims = field(init=False)
     inputs: Inputs = field(default_factory=lambda: Inputs(0))
     step_kind: Step = Step.STALE
     """Of the pose taken at this step."""
@@ -88,6 +90,7 @@ class Board:
         self.track = PoseTrack(TrackLimits(jump_m=f.pose_jump_m, jump_rad=f.pose_jump_rad))
         self.trajectory = Trajectory(self.config.motion)
         self.dock = DockMonitor(self.config.dock)
+        self.claims = Claims(self.config.claims)
 
     # -- what is known ------------------------------------------------------------------------------------------
     @property
@@ -219,6 +222,7 @@ class Board:
         if self.inputs.now_ns:
             self.dt_s = min(max((inputs.now_ns - self.inputs.now_ns) / 1e9, 0.0), 0.2)
         self.inputs, self.correction, self.step_kind = inputs, None, Step.STALE
+        self.claims.take(inputs.claims, inputs.now_ns)
         before = self.track.latest
         if inputs.pose is not None:
             self.step_kind = self.track.add(inputs.pose.message, inputs.pose.received_ns)
@@ -254,6 +258,7 @@ class Board:
         if self.axis_m is not None:
             self.done_xy_m.append(self.axis_m.copy())
         self.docked_count += int(visited)
+        self.claims.done |= visited
 
     def drop_target(self) -> None:
         """Have no target any more."""
@@ -287,6 +292,7 @@ class Board:
         self.drop_target()
         self.visited_ids, self.given_up_ids = [], []
         self.wanted_id = None
+        self.claims.forget()
         self.scan_seen.clear()
         self.scan_turned_rad = 0.0
         self.map_changed = True

@@ -7,6 +7,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from services.fleet.config import ClaimConfig
+
 
 class MotionConfig(BaseModel):
     """What no setpoint may exceed. Metres, seconds, radians; heights above the ground at the start."""
@@ -116,6 +118,8 @@ class NavigatorConfig(BaseModel):
     motion: MotionConfig = MotionConfig()
     dock: DockConfig = DockConfig()
     failsafe: FailsafeConfig = FailsafeConfig()
+    claims: ClaimConfig = ClaimConfig()
+    """Of trees among several aircraft; see docs/fleet.md."""
     handheld: bool = False
     """A person carries the camera: guidance is shown, no vehicle is asked or commanded."""
     trees_wanted: int = Field(default=1, ge=1, le=100)

@@ -37,6 +37,8 @@ class Fault:
     hold_s: float = 0.0
     blind: bool = False
     """Nobody knows where the aircraft is: stop at once instead of braking along a path."""
+    back_off: bool = False
+    """Leave the trunk before landing."""
 
 
 @dataclass
@@ -240,12 +242,20 @@ def _unseen(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
 def _ground_link(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
     del doing
     f = b.config.failsafe
-    if not w.ground_seen or b.inputs.service_age_s("station") <= f.ground_silent_s:
+    if b.claims.leaving or not w.ground_seen or b.inputs.service_age_s("station") <= f.ground_silent_s:
         return None
     return Fault("ground link lost", "hold", "the ground station is out of reach", f.ground_hold_s)
 
 
+def _claim(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
+    """The claim's end is near and no renewal comes: to be down before another may be granted this place."""
+    word = b.claims.lost(doing)
+    if not word or not (w.armed or b.config.handheld):
+        return None
+    return Fault("claim lost", "hold", word, b.config.claims.hold_s, back_off=True)
+
+
 _DETECTORS: tuple[Callable[[Watch, Board, MissionStateName], Fault | None], ...] = (
     _operator, _bridge_restarted, _vehicle_link, _battery, _geofence, _slam, _pose_jump, _services, _target, _trees,
-    _obstacle, _unseen, _ground_link,
+    _obstacle, _unseen, _claim, _ground_link,
 )  # fmt: skip

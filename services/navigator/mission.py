@@ -81,12 +81,14 @@ class Mission:
         self.fault = self.watch.check(self.board, self.state, self._resume)
         self._answer(inputs.now_ns)
         intent = self._intent(inputs.now_ns)
+        self._tell_waiting(intent.word, inputs.now_ns)
         self._move(intent)
         events, self._events = tuple(self._events), []
         self._seq += 1
         failsafe = self.fault.name if self.fault is not None else ""
         telling = Telling(self.state, self.previous, self.since_ns, self.reason, self.mission_id, self._seq, failsafe)
-        return Outputs(telling.guidance(self.board, intent), telling.state_message(self.board), events)
+        wish = self.board.claims.wish(self.board, self.state)
+        return Outputs(telling.guidance(self.board, intent), telling.state_message(self.board), events, wish)
 
     def _place(self) -> None:
         """Put the setpoint where the aircraft is when its pose is new or has jumped; until then there is none.
@@ -147,6 +149,12 @@ class Mission:
     def _give_up_hold(self, word: str, now_ns: int) -> None:
         if self.config.handheld:
             return
+        b = self.board
+        near = self._resume in ("dock", "docked", "undock") and b.axis_m is not None and b.dock_direction is not None
+        if self.fault is not None and self.fault.back_off and near and b.here is not None:
+            b.claims.leaving = True
+            self.go(Next("undock", f"{word}: away from the trunk, then landing"), now_ns)
+            return
         self.go(Next("landing", f"held for {self._held_s(now_ns):.0f} s: {word}"), now_ns)
 
     def hold(self, fault: Fault, cause: HoldCause, now_ns: int) -> None:
@@ -187,6 +195,11 @@ class Mission:
                 return result
             self.go(result, now_ns)
         return Intent("stop")
+
+    def _tell_waiting(self, word: str, now_ns: int) -> None:
+        if word and word != self.reason:
+            self._events.append(Event(now_ns, self.state, self.state, word))
+            self.reason = word
 
     def _holding(self) -> Intent:
         """Stand still; give way to what comes too near."""

@@ -8,6 +8,7 @@ from services.common.version import running_version
 from services.doctor.aboard import against_flight
 from services.doctor.model import VehicleFact
 from services.navigator.board import Board
+from services.navigator.claiming import start_goal
 from services.navigator.config import NavigatorConfig
 
 _VIEW_FRESH_S = 2.0
@@ -17,6 +18,9 @@ _NEEDED = ("camera", "slam", "mapper", "detector", "refiner")
 def missing(board: Board, config: NavigatorConfig) -> list[str]:
     """Return what is not well, in words for the operator; empty when the aircraft may take off."""
     faults = [] if board.here is not None else ["slam gives no pose"]
+    start = start_goal(board)
+    if board.claims.on and start is not None and board.claims.want(start) != "held":
+        faults.append(f"the place to start from is not claimed: {board.claims.word}")
     if config.handheld:
         return faults
     if config.live_guard and board.inputs.age_s(board.inputs.view) > _VIEW_FRESH_S:

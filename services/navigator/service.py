@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
+import secrets
 from collections.abc import Callable
 from typing import get_args
 
 from schemas.camera import RgbdFrame
 from schemas.command import Command, CommandReply, NonceReply, NonceRequest
+from schemas.fleet import ClaimReply, HeldState
 from schemas.health import Health
 from schemas.orders import CommandName
 from schemas.slam import Pose
@@ -17,6 +20,8 @@ from schemas.topics import (
     CAMERA_RGBD,
     COMMAND,
     COMMAND_NONCE,
+    FLEET_CLAIM,
+    FLEET_HELD,
     FUSION_POSE,
     HEALTH,
     MISSION_GUIDANCE,
@@ -32,6 +37,8 @@ from services.camera.depth_codec import FrameError, decode_depth
 from services.common.context import Context
 from services.doctor.model import ServiceFact
 from services.doctor.told import told
+from services.fleet.config import ClaimConfig
+from services.fleet.holder import Asked, ClaimView, Holder, Wish
 from services.navigator.commands import CommandDesk
 from services.navigator.config import NavigatorConfig
 from services.navigator.guard import View, look
@@ -45,10 +52,54 @@ WATCHED = ("camera", "slam", "fusion", "mapper", "detector", "refiner", "autopil
 _ASKED = (*WATCHED, "router", "recorder", "preview")
 """Services whose word preflight wants."""
 _STATE_EVERY = 4
+_TELL_CLAIMS_S = 1.0
 _UNGUARDED = frozenset({"idle", "landed", "failed", "released"})
 """States in which nothing is flown: the eyes are closed."""
 _CARRY_NS = 300_000_000
 """A pose older than this is not carried on to a frame's stamp: the view is good for the sweep only."""
+
+
+class ClaimDesk:
+    """Joins the mission's wishes to the arbiter, where claims are switched on: questions leave without being waited for.
+
+    Leases are counted on the machine's steady clock: simulated time may stand still while the arbiter's runs on.
+    """
+
+    def __init__(self, context: Context, config: ClaimConfig) -> None:
+        self._context = context
+        self._config = config
+        self._holder = Holder(config, lambda: secrets.randbits(62))
+        self._told = 0
+        self._map_id = "none"
+        context.every_wall(_TELL_CLAIMS_S, self._tell)
+
+    def view(self) -> ClaimView:
+        """Return what the mission is to know now."""
+        return self._holder.view(self._context.steady_ns())
+
+    def follow(self, wish: Wish) -> None:
+        """Do what a step of the mission wants, and ask what is due."""
+        c = self._context
+        self._holder.follow(wish)
+        self._map_id = wish.map_id or self._map_id
+        for asked in self._holder.questions(c.steady_ns()):
+            c.health.count(f"claims_{asked.request.kind}")
+            then = functools.partial(self._answered, asked)
+            c.ask_later(FLEET_CLAIM, asked.request, ClaimReply, self._config.ask_timeout_s, then)
+
+    def _answered(self, asked: Asked, replies: list[ClaimReply]) -> None:
+        self._holder.answered(asked, replies, self._context.steady_ns())
+        if not replies:
+            self._context.health.count("claims_unanswered")
+
+    def _tell(self) -> None:
+        c, holder = self._context, self._holder
+        view = self.view()
+        c.publish(FLEET_HELD, HeldState(
+            stamp_ns=c.clock.now_ns(), seq=self._told, map_id=self._map_id, held=view.held, left_s=view.left_s,
+            asked=None if holder.asked is None else holder.asked.goal, undelivered=view.undelivered, note=view.note[:400],
+        ))  # fmt: skip
+        self._told += 1
 
 
 class Navigator:
@@ -67,6 +118,7 @@ class Navigator:
         self._services: dict[str, int] = {}
         self._aboard: dict[str, ServiceFact] = {}
         self._steps = self._states = 0
+        self._claims = ClaimDesk(context, config.claims) if config.claims.enabled else None
 
     def register(self, rate_hz: float) -> None:
         """Connect to the bus."""
@@ -89,10 +141,12 @@ class Navigator:
         now_ns = self._context.clock.now_ns()
         inputs = Inputs(
             now_ns, self._pose, self._trees, self._target, self._vehicle, dict(self._services), self._view,
-            tuple(self._aboard.values()),
+            tuple(self._aboard.values()), None if self._claims is None else self._claims.view(),
         )  # fmt: skip
         with self._context.health.timed("step"):
             outputs = self.mission.step(inputs)
+        if self._claims is not None:
+            self._claims.follow(outputs.wish)
         self._publish(outputs)
 
     def _publish(self, outputs: Outputs) -> None:

@@ -21,8 +21,9 @@ from services.navigator.approaching import (
     yaw_to_axis,
 )
 from services.navigator.board import Board
+from services.navigator.claiming import home_goal, tree_goal
 from services.navigator.routing import route
-from services.navigator.selection import choose
+from services.navigator.selection import Choice, choose
 from services.navigator.trajectory import Aim
 from services.navigator.values import Intent, Next
 
@@ -41,6 +42,8 @@ _GAP_M = 0.025
 _YAW_INTEGRAL_SHARE = 0.4
 _SETTLED_M_S = 0.06
 """Standing offsets are learnt below this speed of the setpoint: while it moves, the aircraft's lag is no offset."""
+_LEAVE_WITHIN_S = 6.0
+"""Backing off without a claim takes no longer: the rest of the lease is for coming down."""
 _YAW_CORRECTION_RAD = float(np.radians(8.0))
 
 
@@ -118,13 +121,32 @@ def select(b: Board, since_s: float) -> Result:
     if here is None or since_s < c.select_settle_s:
         return Intent("stop")
     done = {*b.visited_ids, *b.given_up_ids}
-    choice = choose(b.trees, here.position_m, done, b.done_xy_m, c.select_confidence, b.wanted_id)
+    b.claims.given_up(done)
+    closed = done | b.claims.closed_ids
+    choice = choose(b.trees, here.position_m, closed, b.done_xy_m, c.select_confidence, b.wanted_id)
     if choice.tree is not None:
-        b.choose(choice.tree)
-        return Next("face", choice.reason)
-    if since_s < c.select_wait_s and not b.visited_ids:
+        return _claimed(b, choice)
+    if b.claims.awaited and since_s < c.claims.wait_s:
+        return Intent("stop", word=f"waiting: {b.claims.awaited}")
+    if since_s < c.select_wait_s and not b.visited_ids and not b.claims.closed_words:
         return Intent("stop")
-    return _go_home(b, choice.reason)
+    return _go_home(b, "; ".join(word for word in (choice.reason, b.claims.awaited, b.claims.closed_words) if word))
+
+
+def _claimed(b: Board, choice: Choice) -> Result:
+    """Take a tree that nobody else has; where claims are switched off, at once."""
+    assert choice.tree is not None
+    goal = tree_goal(b, choice.tree)
+    if b.claims.on and goal is not None:
+        by_order = b.wanted_id is not None
+        answer = b.claims.want(goal, again=by_order)
+        if answer == "refused" and by_order:
+            b.wanted_id = None
+        if answer != "held":
+            waiting = b.claims.awaited
+            return Intent("stop", word=f"waiting: {waiting}" if waiting else f"claiming tree {choice.tree.id}")
+    b.choose(choice.tree)
+    return Next("face", f"{choice.reason}; claimed" if b.claims.on else choice.reason)
 
 
 def face(b: Board, since_s: float) -> Result:
@@ -198,6 +220,8 @@ def undock(b: Board, since_s: float) -> Result:
     if b.axis_m is None or b.dock_direction is None:
         return Next("select", "the target is gone from the map")
     left = c.undock_m - float(np.linalg.norm(here.position_m[:2] - b.axis_m))
+    if b.claims.leaving and (left < 0.1 or since_s > _LEAVE_WITHIN_S):
+        return Next("landing", "clear of the trunk, without a claim")
     if left < 0.1 or since_s > 20.0:
         b.drop_target()
         if b.docked_count >= b.trees_wanted or b.homeward:
@@ -217,6 +241,12 @@ def return_home(b: Board, since_s: float) -> Result:
     left = float(np.linalg.norm(here.position_m[:2] - b.home_m[:2]))
     if left < 0.2:
         return Next("landing", f"back at the start within {left:.2f} m")
+    if b.claims.on:
+        goal = home_goal(b)
+        if goal is not None and b.claims.want(goal) != "held":
+            if b.claims.waited_s > b.config.claims.wait_s:
+                return Next("landing", f"no free way back: landing {left:.1f} m from the start: {b.claims.word}")
+            return Intent("stop", word=f"claiming the way back: {b.claims.word}")
     way = route(b, b.trajectory.position_m[:2], b.home_m[:2])
     if way is None or since_s > 120.0:
         return Next("landing", f"no way back: landing {left:.1f} m from the start")

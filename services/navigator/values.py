@@ -11,6 +11,7 @@ from schemas.slam import Pose
 from schemas.trees import Target, TreeList
 from schemas.vehicle import VehicleState
 from services.doctor.model import ServiceFact
+from services.fleet.holder import ClaimView, Wish
 from services.navigator.guard import View
 from services.navigator.trajectory import Aim
 
@@ -39,6 +40,8 @@ class Inputs:
     """What the depth image shows, for the live guard."""
     aboard: tuple[ServiceFact, ...] = ()
     """What the services' latest health says, for preflight."""
+    claims: ClaimView | None = None
+    """Of the claims on trees; None where they are switched off."""
 
     def age_s(self, seen: Seen[T] | None) -> float:
         """Return the seconds since a message came, inf when none did."""
@@ -67,6 +70,8 @@ class Outputs:
     guidance: Guidance
     state: MissionState
     events: tuple[Event, ...]
+    wish: Wish = field(default_factory=Wish)
+    """What is wanted of the claims on trees."""
 
 
 Motion = Literal["aim", "brake", "freeze", "follow"]
@@ -84,6 +89,8 @@ class Intent:
     unit: Literal["m", "rad", ""] = ""
     engage: bool = True
     land: bool = False
+    word: str = ""
+    """Why the state waits, for the operator; empty: the reason it was entered for stands."""
 
 
 @dataclass(frozen=True, slots=True)

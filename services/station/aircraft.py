@@ -6,6 +6,7 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 
+from schemas.fleet import HeldState
 from schemas.health import Health
 from schemas.navigation import MissionState
 from schemas.slam import Pose
@@ -39,6 +40,7 @@ class Aircraft:
     mission: MissionState | None = None
     target: Target | None = None
     vehicle: VehicleState | None = None
+    held: HeldState | None = None
     trees: TreeList | None = None
     trees_version: int = 0
     health: dict[str, Health] = field(default_factory=dict)
@@ -90,6 +92,10 @@ class Aircraft:
     def on_target(self, target: Target) -> None:
         """Take what the depth image shows."""
         self.target = target
+
+    def on_held(self, held: HeldState) -> None:
+        """Take what the aircraft believes to hold."""
+        self.held = held
 
     def on_vehicle(self, vehicle: VehicleState) -> None:
         """Take the vehicle's state and tell of changes of mode, arming, battery and connection."""

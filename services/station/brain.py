@@ -78,6 +78,8 @@ class Brain:
         self.refused = 0
         self.on_cloud_wish: Callable[[str], None] = lambda _: None
         """Told when a page begins to look at an aircraft's cloud."""
+        self.fleet_view: Callable[[], dict[str, Any] | None] = lambda: None
+        """Who holds which tree; None where this station is no arbiter."""
         self._pages = pages
         self._send_order = send_order
         self._state = 0
@@ -111,7 +113,7 @@ class Brain:
         return _json({
             "t": "state", "n": self._state, "hz": self.config.page_hz,
             "aircraft": [aircraft_view(a, self.desk, now_s) for a in self.fleet.values()],
-            "operators": operators_view(self.desk),
+            "operators": operators_view(self.desk), "fleet": self.fleet_view(),
         })  # fmt: skip
 
     def tell_trees(self) -> None:

@@ -6,6 +6,7 @@ import ipaddress
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from services.fleet.config import FleetConfig
 from services.inventory.config import InventoryConfig
 
 
@@ -47,6 +48,8 @@ class StationConfig(BaseModel):
     cloud: bool = True
     """Let pages see the point cloud in the 3D view: the radio carries it (``map/sketch``) while one looks, and only then."""
     inventory: InventoryConfig = InventoryConfig()
+    fleet: FleetConfig = FleetConfig()
+    """Which aircraft may have which tree; see docs/fleet.md."""
 
     @property
     def local(self) -> bool:

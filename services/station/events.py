@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-EventKind = Literal["mission", "command", "operator", "link", "service", "inventory"]
+EventKind = Literal["mission", "command", "operator", "link", "service", "inventory", "claim"]
 EventLevel = Literal["info", "good", "warn", "bad"]
 
 _KEPT = 400

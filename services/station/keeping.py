@@ -10,7 +10,7 @@ from services.inventory.config import InventoryConfig
 from services.inventory.export import csv_bytes, geojson_bytes, tree_rows
 from services.inventory.keeper import Keeper, Tone
 from services.inventory.store import open_store
-from services.inventory.values import AuditLine
+from services.inventory.values import AuditLine, Laid
 from services.station.aircraft import Aircraft
 from services.station.events import Event, EventLog
 from services.station.web import Download
@@ -50,6 +50,10 @@ class Keeping:
         visited = mission.visited_tree_ids if mission is not None and same else ()
         in_air = aircraft.map_begun_in_air and aircraft.trail_map == trees.map_id
         self.keeper.offer(aircraft.uav, trees, frozenset(visited), in_air=in_air)
+
+    def laid(self) -> dict[tuple[str, str], Laid]:
+        """Return where the maps of flights lie on the earth, as far as the inventory knows."""
+        return {} if self.keeper is None else self.keeper.laid
 
     def close(self) -> None:
         """Commit what is left."""

@@ -26,6 +26,7 @@ from schemas.health import Health
 from schemas.preview import PreviewImage
 from schemas.sketch import SubmapSketch
 from schemas.topics import (
+    FLEET_HELD,
     HEALTH,
     MAP_SKETCH,
     MISSION_STATE,
@@ -44,6 +45,7 @@ from services.common.runtime import LiveContext
 from services.navigator.client import send_command
 from services.station.aircraft import Aircraft
 from services.station.brain import Brain, Outgoing
+from services.station.claims import Claims
 from services.station.cloud import CloudView
 from services.station.ears import Ears
 from services.station.guard import Guard
@@ -63,7 +65,7 @@ _NOT_ABOARD = frozenset({"router", "recorder"})
 _CLOUD_ASKS, _CLOUD_TIMEOUT_S, _CLOUD_AGAIN_S = 12, 5.0, 5.0
 _TOPICS: dict[Topic, Callable[[Aircraft, Any], object]] = {
     SLAM_POSE: Aircraft.on_pose, MISSION_STATE: Aircraft.on_mission, VEHICLE_STATE: Aircraft.on_vehicle,
-    TREES_TARGET: Aircraft.on_target, HEALTH: Aircraft.on_health,
+    TREES_TARGET: Aircraft.on_target, HEALTH: Aircraft.on_health, FLEET_HELD: Aircraft.on_held,
 }  # fmt: skip
 
 
@@ -88,9 +90,21 @@ class Station:
         self._clouds_asked_s: dict[str, float] = {}
         self.keeping = Keeping(self.config.inventory, self.brain.log, context.health, self.call)
         self.site.downloads = self.keeping.downloads()
+        self.claims = self._arbiter()
         self._told = context.inbox.mailbox(lambda call: call(), _REQUEST_RING)
         self._server = WebServer(self.site, self.config, self._bound())
         self.address = self._address(token)
+
+    def _arbiter(self) -> Claims | None:
+        """Return the arbiter of the fleet, where this station is the one that has it."""
+        if not self.config.fleet.enabled:
+            return None
+        c = self._context
+        claims = Claims(
+            self.config.fleet, self.config.inventory, self.brain.log, c.health, self.keeping.laid, c.steady_ns
+        )
+        self.brain.fleet_view = claims.view
+        return claims
 
     def _token(self) -> str:
         """Return what browsers must know: none on this machine alone, nor where certificates are asked for."""
@@ -172,6 +186,8 @@ class Station:
         # each list replaces the last, and decoding them is most of the work: on a busy machine old ones give way to the state
         bus.subscribe(TREES_LIST, functools.partial(self._on_trees, aircraft), ring=_TREES_RING)
         bus.subscribe(PREVIEW_IMAGE, functools.partial(self._on_preview, aircraft))
+        if self.claims is not None:
+            self.claims.attach(aircraft, bus)
         for early in sorted(pair for pair in self._waiting if pair[0] == uav):
             self._waiting.discard(early)
             aircraft.on_live(early[1], alive=True)
@@ -286,6 +302,8 @@ class Station:
         self._context.health.counters["slow_pages"] = self.site.cut_off
 
     def _stop(self) -> None:
+        if self.claims is not None:
+            self.claims.close()
         self.keeping.close()
         self._server.stop()
         self._pool.shutdown(wait=False, cancel_futures=True)

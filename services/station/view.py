@@ -39,6 +39,7 @@ def aircraft_view(a: Aircraft, desk: OperatorDesk, now_s: float) -> dict[str, An
         "mission": _mission(a, now_s),
         "target": _target(a, now_s),
         "vehicle": _vehicle(a, now_s),
+        "claim": _claim(a, now_s),
         "trees_version": a.trees_version,
         "topics": [
             [name, _r(entry.age_s(now_s), 2), entry.level(now_s), _r(entry.rate_hz(now_s), 1), entry.missed]
@@ -84,6 +85,17 @@ def _target(a: Aircraft, now_s: float) -> dict[str, Any] | None:
         "range": _r(t.range_m, 2), "radius": _r(t.radius_m, 3),
         "at": None if t.position_map_m is None else [_r(v, 3) for v in t.position_map_m],
         "age": _r(a.links.age_s("trees/target", now_s), 2),
+    }  # fmt: skip
+
+
+def _claim(a: Aircraft, now_s: float) -> dict[str, Any] | None:
+    c = a.held
+    if c is None:
+        return None
+    return {
+        "kind": None if c.held is None else c.held.kind, "tree": None if c.held is None else c.held.tree_id,
+        "left": _r(c.left_s, 0), "asked": None if c.asked is None else c.asked.tree_id, "undelivered": c.undelivered,
+        "note": c.note, "age": _r(a.links.age_s("fleet/held", now_s), 2),
     }  # fmt: skip
 
 

@@ -15,7 +15,7 @@ HEAVY = ("open3d", "cv2", "gtsam", "numba", "scipy", "filterpy", "zenoh")
 # what a service may know besides its core: the files that are allowed to touch bus, clock and files
 SHELL_FILES = {"service.py", "__main__.py", "config.py", "bus.py"}
 MAY_READ_TRUTH = {"simulator", "evaluate", "cli"}
-CORE_PACKAGES = ("slam", "mapper", "detector", "navigator")
+CORE_PACKAGES = ("slam", "mapper", "detector", "navigator", "fleet")
 ADDRESS_OR_MACHINE_PATH = re.compile(
     r"pypi\s*[.]\s*\w+|pythonhosted|(?:extra-)?index-url\b|(?<![\w.])/(?:work|root)/\w|(?<![\w.])/tmp/(?:lead|missions|bash)"
 )

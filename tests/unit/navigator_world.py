@@ -12,6 +12,7 @@ from schemas.trees import Target, Tree, TreeList
 from schemas.vehicle import VehicleState
 from services.common.geometry import Matrix, level_camera, rotation_z, to_transform, wrap_angle
 from services.evaluate.eyes import Round, see
+from services.fleet.holder import ClaimView
 from services.navigator.config import NavigatorConfig
 from services.navigator.guard import View
 from services.navigator.mission import Mission
@@ -104,12 +105,17 @@ class World:
         self.least_m = min([self.least_m, *(float(np.hypot(*(w - self.position_m[:2]))) for w in self.walkers)])
         self._sense()
         inputs = Inputs(
-            self.now_ns, self._pose, self._trees, self._target, self._vehicle, dict(self._seen_ns), self._view()
-        )
+            self.now_ns, self._pose, self._trees, self._target, self._vehicle, dict(self._seen_ns), self._view(),
+            claims=self.claims(),
+        )  # fmt: skip
         self.outputs = self.mission.step(inputs)
         self.events.extend(self.outputs.events)
         self._actuate(self.outputs)
         return self.outputs
+
+    def claims(self) -> ClaimView | None:
+        """What the mission knows of its claims: nothing, they are off."""
+        return None
 
     def run(self, until: str | tuple[str, ...] | None = None, seconds: float = 200.0) -> str:
         wanted = (until,) if isinstance(until, str) else until or ()

@@ -27,8 +27,9 @@ export function drawMission(craft, now, hidden) {
   set($("mission-for"), "class", late ? "mission-for late" : "mission-for");
   const same = mission.reason.toLowerCase() === mission.state;
   text($("mission-reason"), (mission.failsafe ? `Failsafe ${words(mission.failsafe)}: ` : "") + (same ? "" : mission.reason));
-  $("mission-target").hidden = mission.target === null;
-  if (mission.target !== null) text($("mission-target"), targetWords(mission));
+  const claim = claimWords(craft.view.claim);
+  $("mission-target").hidden = mission.target === null && !claim;
+  text($("mission-target"), [mission.target === null ? "" : targetWords(mission), claim].filter(Boolean).join(" · "));
   set($("mission"), "data-tone", late || mission.failsafe ? "warn" : TONES[mission.state] ?? "fly");
   drawSteps(mission);
 }
@@ -38,6 +39,14 @@ function targetWords({ target, distance, heading_error: off }) {
   if (distance !== null) parts.push(`${distance.toFixed(2)} m`);
   if (degrees !== null) parts.push(degrees === 0 ? "straight ahead" : `${Math.abs(degrees)}° ${degrees > 0 ? "left" : "right"}`);
   return parts.join(" · ");
+}
+
+const CLAIMED = { place: "its place", way: "the way home" };
+
+/** What the aircraft believes to hold among several; empty where nothing is claimed. */
+export function claimWords(claim) {
+  if (!claim?.kind) return "";
+  return `${claim.kind === "tree" ? `tree ${claim.tree}` : CLAIMED[claim.kind]} claimed, ${Math.round(claim.left)} s`;
 }
 
 /** Where in the mission it is; a hold stands at the step that it interrupted. */

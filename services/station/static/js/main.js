@@ -81,6 +81,7 @@ class Page {
     if (this.craft && !this.crafts.has(this.craft.uav)) this.craft = null;
     if (!this.craft && names.size) this.choose([...names][0]);
     this.operators = message.operators;
+    this.fleet = message.fleet;
     this.map.dirty = true;
   }
 
@@ -285,7 +286,7 @@ class Page {
     drawVitals(craft, now);
     if (!$("panel-trees").hidden) drawTrees(craft, this);
     if (!$("panel-log").hidden) drawLog(this.events, this.grid ? null : craft?.uav, this.crafts.size > 1);
-    drawSystems(craft, now);
+    drawSystems(craft, now, this.fleet);
     drawPreview(this, craft, now);
     this.orders.draw();
     this.map.dirty ||= craft ? craft.link(now) !== this.linkWas : false;

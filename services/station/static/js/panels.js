@@ -101,7 +101,17 @@ export function drawLog(events, uav, several) {
 
 // -- systems
 
-export function drawSystems(craft, now) {
+/** Who holds what, by the arbiter's book. */
+function fleetRows({ leases, visited, waits }) {
+  const rows = [{ key: "g3", group: `Claims of the fleet: ${visited} trees visited${waits ? `, none granted for ${duration(waits)}` : ""}` }];
+  for (const { uav, kind, tree, left } of leases) {
+    const what = kind === "tree" ? `tree ${tree}` : kind === "way" ? "way home" : "its place";
+    rows.push({ key: `c/${uav}/${what}`, name: uav, level: left < 15 ? "late" : "good", age: null, right: what, note: `${Math.round(left)} s left` });
+  }
+  return rows;
+}
+
+export function drawSystems(craft, now, fleet) {
   const panel = $("panel-systems"), view = craft?.view;
   if (!view) {
     panel.replaceChildren(el("p", { class: "empty", "data-key": "empty" }, "Nothing is heard yet."));
@@ -119,6 +129,7 @@ export function drawSystems(craft, now) {
   for (const [name, age, , rate] of view.topics) {
     rows.push({ key: `t/${name}`, name, level: levelOf(craft, name, now), age: craft.age(age, now), right: lost ? "" : `${rate.toFixed(rate < 10 ? 1 : 0)} Hz`, note: "" });
   }
+  if (fleet) rows.push(...fleetRows(fleet));
   keyed(panel, rows, (r) => r.key, (r) => (r.group ? el("div", { class: "group" }, r.group) : el("div", { class: "sys" }, el("i", { class: "dot" }), el("b"), el("span", { class: "rate" }), el("span", { class: "age" }), el("div", { class: "note" }))), (node, r) => {
     if (r.group) return;
     const [dot, name, rate, age, note] = node.children;
@@ -126,7 +137,7 @@ export function drawSystems(craft, now) {
     set(dot, "data-level", r.level);
     text(name, r.name);
     text(rate, r.right);
-    text(age, r.age === null ? "never" : `${duration(r.age)}${r.level === "late" || r.level === "lost" ? " late" : ""}`);
+    text(age, r.key.startsWith("c/") ? "" : r.age === null ? "never" : `${duration(r.age)}${r.level === "late" || r.level === "lost" ? " late" : ""}`);
     text(note, r.note);
     set(note, "hidden", r.note ? null : "");
   });
