@@ -248,7 +248,7 @@ def _ground_link(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
 
 
 def _claim(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
-    """The claim's end is near and no renewal comes: to be down before another may be granted this place."""
+    """Come down while the claim still holds, when no renewal comes: afterwards another may be granted this place."""
     word = b.claims.lost(doing)
     if not word or not (w.armed or b.config.handheld):
         return None
