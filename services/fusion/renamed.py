@@ -96,3 +96,17 @@ class RenamedContext:
         """Ask under the other name."""
         other = self._names.get(topic, topic)
         return [] if other is None else self._context.ask(other, request, kind, timeout_s, leaf)
+
+    def ask_later(
+        self, topic: Topic, request: Wire, kind: type[A], timeout_s: float, then: Callable[[list[A]], None]
+    ) -> None:
+        """Ask under the other name; nobody answers where there is none."""
+        other = self._names.get(topic, topic)
+        if other is None:
+            then([])
+        else:
+            self._context.ask_later(other, request, kind, timeout_s, then)
+
+    def steady_ns(self) -> int:
+        """As of the context behind."""
+        return self._context.steady_ns()
