@@ -69,7 +69,7 @@ class DockMonitor:
         reason = self._fault(t, distance, bearing, positions)
         if not reason and since_s < self.config.prefer_s and abs(distance - self.config.aim_m) > self.config.prefer_m:
             reason = "could be nearer to the aim"
-        text = f"{distance:.3f} m, {np.degrees(bearing):+.1f} deg"
+        text = f"{distance:.3f} m, {np.degrees(bearing):+z.1f} deg"
         return DockVerdict(
             docked=not reason, reason=f"{text}: {reason}" if reason else text, distance_m=distance, bearing_rad=bearing
         )
