@@ -25,6 +25,7 @@ from services.evaluate.station_load import Load
 _AIRCRAFT, _RATE_HZ, _TREES = 10, 5.0, 500
 _MEASURE_S, _QUICK_S = 20.0, 8.0
 _KILLS, _QUICK_KILLS = 100, 5
+_STILL_S = 3.0
 _CODE = (
     "services.station",
     "services.inventory",
@@ -82,16 +83,14 @@ def _load(ground: Ground, load: Load, seconds: float, tell: Callable[[str], None
         load.go(on=True)
         until(lambda: counted() > 500, 30.0)
         load.go(on=False)
-        time.sleep(2.5)
-        sent, before = load.sent, counted()
+        sent, before = load.sent, _at_rest(counted)
         page = psutil.Process(ground.processes["station"].pid)
         cpu_s, begin_s = sum(page.cpu_times()[:2]), time.monotonic()
         load.go(on=True)
         fps = _frame_rate(ground, seconds)
         load.go(on=False)
         used_s, took_s = sum(page.cpu_times()[:2]) - cpu_s, time.monotonic() - begin_s
-        time.sleep(2.5)
-        lost = (load.sent - sent) - (counted() - before)
+        lost = (load.sent - sent) - (_at_rest(counted) - before)
         load.go(on=True)
         figures = {
             "messages_sent": load.sent - sent, "messages_lost": lost, "cpu_cores": round(used_s / took_s, 3),
@@ -102,6 +101,17 @@ def _load(ground: Ground, load: Load, seconds: float, tell: Callable[[str], None
     dropped = {k: n for k, n in health["station"].counters.items() if k.startswith(("dropped", "decode"))}
     tell(f"load: {figures}, the station's own count of gaps: {dropped or 'none'}")
     return figures
+
+
+def _at_rest(counted: Callable[[], int], timeout_s: float = 30.0) -> int:
+    """Return the count once it has stood still for longer than the station's health takes to come (a busy machine lags)."""
+    end_s = time.monotonic() + timeout_s
+    last, since_s = counted(), time.monotonic()
+    while time.monotonic() < min(end_s, since_s + _STILL_S):
+        time.sleep(0.1)
+        if (now := counted()) != last:
+            last, since_s = now, time.monotonic()
+    return last
 
 
 def _frame_rate(ground: Ground, seconds: float) -> float | None:
