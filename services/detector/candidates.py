@@ -64,9 +64,10 @@ def judge(stacks: list[Stack], around: Surroundings) -> tuple[list[Trunk], list[
         found = _examine(stack, cylinder, kept, around)
         if isinstance(found, Rejection):
             rejections.append(found)
-            dropped.append(Stem(Arm.of_stack(stack), found.reason.endswith(BENT)))
-            if found.reason == _NO_CYLINDER and stack.layers >= _ARM_LAYERS:
-                unsure.append(Arm.of_stack(stack))
+            bent = found.reason.endswith(BENT)
+            dropped.append(Stem(Arm.of_stack(stack), bent))
+            if (bent or found.reason == _NO_CYLINDER) and stack.layers >= _ARM_LAYERS:
+                unsure.append(Arm.of_stack(stack, bent=bent))
         else:
             kept.append(found)
     kept, joined = join_forks(kept, unsure, dropped, around.frame, around.ground)
@@ -188,7 +189,7 @@ def _as_trunk(candidate: Candidate, around: Surroundings) -> Trunk:
     axis = axis / np.linalg.norm(axis)
     base = frame.to_input(candidate.base)
     sigma_xy, sigma_radius = _doubts(candidate, along, radius, around.config)
-    remark = _unsuitable(radius, lean, candidate.fork_m, around.config)
+    remark = _forked_low(candidate, around.config) or _unsuitable(radius, lean, around.config)
     return Trunk(
         base_m=(float(base[0]), float(base[1]), float(base[2])), axis=(float(axis[0]), float(axis[1]), float(axis[2])),
         radius_m=radius, radius_height_m=height, taper=c.taper, height_seen_m=candidate.top_m, low_seen_m=candidate.low_m,
@@ -217,9 +218,18 @@ def _doubts(candidate: Candidate, along: float, radius: float, config: DetectorC
     return float(sigma_xy), float(np.sqrt(max(fit_radius, 0.0) + (one_sided + 0.1) * shape_radius**2))
 
 
-def _unsuitable(radius: float, lean: float, fork_m: float | None, config: DetectorConfig) -> str:
-    if fork_m is not None and fork_m < config.suitable_fork_m:
-        return f"forks {fork_m:.1f} m above ground"
+def _forked_low(candidate: Candidate, config: DetectorConfig) -> str:
+    """Tell a fork that is low, or may be: where its stem is hidden, how high the arms' axes meet is a guess."""
+    if candidate.fork_m is None:
+        return ""
+    if candidate.fork_m < config.suitable_fork_m:
+        return f"forks {candidate.fork_m:.1f} m above ground"
+    if candidate.fork_m < candidate.low_m:
+        return f"forks somewhere below {candidate.low_m:.1f} m, where it is hidden"
+    return ""
+
+
+def _unsuitable(radius: float, lean: float, config: DetectorConfig) -> str:
     if radius > config.max_suitable_radius_m:
         return "too thick"
     if radius < config.min_suitable_radius_m:

@@ -16,6 +16,8 @@ BENT = "lie on one line: a fork, or a bush"
 _MIN_ANGLE_RAD = 0.14
 _SEEN_FROM_M = 0.15
 """An arm begins at least so far above where its stem is seen to begin."""
+_HIDDEN_M, _CLEAR_M = 0.6, 0.1
+"""A line that is no trunk by itself tells a fork only to an arm whose lowest 0.6 m is hidden, and meets it below both."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +29,8 @@ class Arm:
     radius_m: float
     z_low_m: float
     z_high_m: float
+    bent: bool = False
+    """Of slices that do not lie on one line: a fork's other arm, or a bush."""
 
     @classmethod
     def of_cylinder(cls, c: Cylinder) -> Arm:
@@ -34,10 +38,10 @@ class Arm:
         return cls(c.at_m, c.axis, c.radius_m, c.z_low_m, c.z_high_m)
 
     @classmethod
-    def of_stack(cls, s: Stack) -> Arm:
+    def of_stack(cls, s: Stack, *, bent: bool = False) -> Arm:
         """Return the arm that a line of slices shows."""
         axis = np.array([s.slope[0], s.slope[1], 1.0])
-        return cls(s.at_m, axis / np.linalg.norm(axis), s.radius_m, s.z_low_m, s.z_high_m)
+        return cls(s.at_m, axis / np.linalg.norm(axis), s.radius_m, s.z_low_m, s.z_high_m, bent)
 
     def point(self, z_m: float) -> Floats:
         """Return the axis point (3,) at a height."""
@@ -101,9 +105,11 @@ def find_stem(arm: Arm, below: Sequence[Stem]) -> tuple[int, float] | None:
 
 
 def find_forks(arms: list[Arm], sure: int, ground: Ground) -> list[Fork]:
-    """Return pairs of arms: axes at an angle that meet below both arms, between a little under ground and 2 m above.
+    """Return pairs of arms: axes at an angle that meet between a little under ground and 2 m above, below what is seen.
 
-    Only the first ``sure`` arms are trunks; the others can be the second arm of one of those. Trees that merely stand close have axes that pass each other, or meet far below the ground.
+    Only the first ``sure`` arms are trunks; the others can be the second arm of one of those. Two trunks may meet inside
+    the lower one's height: its stem is then seen, and no two trees go through each other. Trees that merely stand close
+    have axes that pass each other, or meet far below the ground.
     """
     forks = []
     for i, a in enumerate(arms[:sure]):
@@ -114,10 +120,15 @@ def find_forks(arms: list[Arm], sure: int, ground: Ground) -> list[Fork]:
             if _angle(a, b) < _MIN_ANGLE_RAD:
                 continue
             z, distance = _closest(a, b)
-            if distance > 0.5 * (a.radius_m + b.radius_m) + 0.02 or z > min(a.z_low_m, b.z_low_m) + 0.25:
+            if distance > 0.5 * (a.radius_m + b.radius_m) + 0.02:
+                continue
+            lower, upper = sorted((a.z_low_m, b.z_low_m))
+            if z > (upper if j < sure else lower) + 0.25:
                 continue
             at = 0.5 * (a.point(z) + b.point(z))
-            height = z - ground.height_m(float(at[0]), float(at[1]))
-            if -0.15 <= height <= 2.0:
-                forks.append(Fork(i, j, at, height))
+            foot_m = ground.height_m(float(at[0]), float(at[1]))
+            if b.bent and (lower < z + _CLEAR_M or a.z_low_m < foot_m + _HIDDEN_M):
+                continue
+            if -0.15 <= z - foot_m <= 2.0:
+                forks.append(Fork(i, j, at, z - foot_m))
     return forks
