@@ -16,6 +16,7 @@ from services.common.geometry import Matrix, inverse, rotation_z
 from services.fusion.config import FusionConfig
 from services.fusion.gps import GpsDesk
 from services.fusion.inertial import Inertial
+from services.fusion.second_eye import SecondEye
 from services.fusion.sight import Doubt, Sight, contradicts
 from services.fusion.smoother import Smoother, State
 from services.fusion.values import (
@@ -54,7 +55,7 @@ class Fuser:
 
     def __init__(self, config: FusionConfig, T_body_camera: Matrix, T_body_second: Matrix | None = None) -> None:
         self.config = config
-        self._T_body_camera, self._T_body_second = T_body_camera, T_body_second
+        self._T_body_camera = T_body_camera
         self.inertial = Inertial(config.imu_noise)
         self.gps: GpsDesk | None = GpsDesk(config) if config.gps else None
         self.smoother: Smoother | None = None
@@ -63,12 +64,12 @@ class Fuser:
         """Added to slam's own reset counter: jumps that slam did not tell."""
         self._anchor: _Anchor | None = None
         self._doubt = Doubt(config)
-        self._first, self._second = Sight(), Sight()
-        self._joined: tuple[int, Located] | None = None
-        """The newest state at which the second camera is located."""
-        self._checked = -1
-        self._seen_ns = self._seen_second_ns = self._began_ns = -1
+        self._first = Sight()
+        self._eye = None if T_body_second is None else SecondEye(T_body_second)
+        self._began_ns = -1
         self._blind = True
+        self._pace = Moved(np.eye(4), _TIE)
+        """The last step that the first camera told."""
 
     # -- in -----------------------------------------------------------------------------------------------------
     def imu(self, reading: ImuReading) -> None:
@@ -99,22 +100,18 @@ class Fuser:
 
     def second(self, stamp_ns: int, located: Located | None) -> Fused | None:
         """Take a frame of the second camera; a pose is returned only where it alone tells the motion (no IMU)."""
-        if self._T_body_second is None:
+        s, eye = self.smoother, self._eye
+        if eye is None:
             return None
-        self._second.take(stamp_ns, located)
-        s = self.smoother
+        eye.take(stamp_ns, located)
         if located is None or s is None:
             return None
-        self._seen_second_ns = stamp_ns
-        self._join_second()
+        eye.join(s)
         lost = self._first.newest_ns >= stamp_ns and self._first.at(stamp_ns) is None
-        alone = not s.inertial and stamp_ns > s.last.stamp_ns and lost
-        if not alone or self._joined is None or self._joined[1].epoch != located.epoch:
+        if s.inertial or stamp_ns <= s.last.stamp_ns or not lost:
             return None
-        if self._joined[0] != s.last.index:
-            return None
-        state = s.step(stamp_ns, relative(self._joined[1], located, self._T_body_second))
-        return self._told_at(state)
+        step = eye.step(s, located)
+        return None if step is None else self._told_at(s.step(stamp_ns, step))
 
     def silence(self, stamp_ns: int) -> Fused | None:
         """Return the pose at a moment for which no frame came, carried on by the IMU."""
@@ -141,7 +138,9 @@ class Fuser:
         tilt = max(0.03, float(np.sqrt(located.covariance.diagonal()[3:5].max())))
         s.begin(located.stamp_ns, T_W_body, tilt, velocity)
         self.smoother, self._anchor = s, _Anchor(0, located)
-        self._joined, self._checked, self._began_ns = None, -1, located.stamp_ns
+        self._began_ns = located.stamp_ns
+        if self._eye is not None:
+            self._eye.begin()
         self._doubt.clear()
         self._solve()
         return self._as_told(located)  # type: ignore[return-value]
@@ -167,25 +166,34 @@ class Fuser:
     def _follow(self, located: Located) -> Fused | None:
         """Go on with a located frame; a state is made of it when one is due."""
         s, anchor = self._window()
-        self._seen_ns = located.stamp_ns
         due = located.stamp_ns - s.last.stamp_ns >= self.config.state_s * 1e9
         same = anchor.located.epoch == located.epoch and anchor.index == s.last.index
         if not (due or self._blind or not same):
             return self._as_told(located)
         if not same and not s.inertial and anchor.located.epoch[0] != located.epoch[0]:
             return self._restart(located)
-        step = relative(anchor.located, located, self._T_body_camera)
+        step = self._step(s, anchor, located, same=same)
         state = s.step(located.stamp_ns, step)
-        if same:
-            s.join(anchor.index, state.index, step)
-        elif anchor.located.epoch[0] == located.epoch[0] and s.holds(anchor.index):
-            s.join(anchor.index, state.index, Moved(step.T, step.covariance + _TIE), robust=True)
-        elif self._blind:
-            self._unknown_way(_WALK_M_S)
+        if step is not None:
+            s.join(anchor.index, state.index, step, robust=not same)
         self._anchor, self._blind = _Anchor(state.index, located), False
-        if not self._settle(state, seen=True):
+        if not self._settle(seen=True):
             return self._begin(located, state.T_W_body)
         return self._as_told(located)
+
+    def _step(self, s: Smoother, anchor: _Anchor, located: Located, *, same: bool) -> Moved | None:
+        """Return how the body moved since the last located state, as far as the map can tell; None: the IMU alone knows.
+
+        A place found again in the same map is one, with doubt. A map that slam has corrected says nothing of the way in
+        between: without IMU the aircraft is taken to have gone on as before.
+        """
+        step = relative(anchor.located, located, self._T_body_camera)
+        if same:
+            self._pace = step
+            return step
+        if self._blind and anchor.located.epoch[0] == located.epoch[0] and s.holds(anchor.index):
+            return Moved(step.T, step.covariance + _TIE)
+        return None if s.inertial else Moved(self._pace.T, self._pace.covariance + _TIE)
 
     def _contradicted(self, located: Located) -> bool:
         """Whether the IMU says that the camera cannot be where slam says; what slam keeps to is believed in the end."""
@@ -229,9 +237,9 @@ class Fuser:
             self.gps.blind(anchor.located.stamp_ns)
         self._blind = True
         s.keep(anchor.index)
-        if not self._settle(state, seen=self._carried_by_second(state.stamp_ns)):
+        if not self._settle(seen=self._second_sees(state.stamp_ns)):
             return None
-        carrier: Carrier = "second" if self._carried_by_second(state.stamp_ns) else "imu"
+        carrier: Carrier = "second" if self._second_sees(state.stamp_ns) else "imu"
         limit_s = self.config.second_alone_s if carrier == "second" else self.config.imu_alone_s
         if (state.stamp_ns - anchor.located.stamp_ns) * 1e-9 > limit_s or not s.holds(anchor.index):
             return None
@@ -248,40 +256,22 @@ class Fuser:
         T = inverse(self._T_body_camera) @ moved.T @ self._T_body_camera
         return carried(anchor.located, T, A @ moved.covariance @ A.T)
 
-    def _carried_by_second(self, stamp_ns: int) -> bool:
-        return self._seen_second_ns >= 0 and stamp_ns - self._seen_second_ns < 200_000_000
+    def _second_sees(self, stamp_ns: int) -> bool:
+        return self._eye is not None and self._eye.sees(stamp_ns)
 
     # -- the window ---------------------------------------------------------------------------------------------
-    def _settle(self, state: State, *, seen: bool) -> bool:
+    def _settle(self, *, seen: bool) -> bool:
         """Join what else is known of the states and solve; False when the window broke and a new one is needed."""
         s = self.smoother
         assert s is not None
-        self._join_second()
+        if self._eye is not None:
+            self._eye.join(s)
         if self.gps is not None:
             for placement in self.gps.due(s.states, seen=seen):
                 if s.holds(placement.index):
                     antenna = np.asarray(self.config.gps_noise.antenna_m)
                     s.place(placement.index, placement.position_W_m, placement.covariance, antenna)
-        del state
         return self._solve()
-
-    def _join_second(self) -> None:
-        """Join states by the second camera, as far as its slam has answered."""
-        s = self.smoother
-        if s is None or self._T_body_second is None:
-            return
-        for state in s.states:
-            if state.index <= self._checked:
-                continue
-            if state.stamp_ns > self._second.newest_ns:
-                return
-            self._checked = state.index
-            located = self._second.at(state.stamp_ns)
-            if located is None:
-                continue
-            before, self._joined = self._joined, (state.index, located)
-            if before is not None and before[1].epoch == located.epoch and s.holds(before[0]):
-                s.join(before[0], state.index, relative(before[1], located, self._T_body_second))
 
     def _window(self) -> tuple[Smoother, _Anchor]:
         """Return both, once there are any."""

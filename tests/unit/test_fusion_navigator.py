@@ -69,3 +69,13 @@ def test_a_carried_pose_is_none_to_the_track() -> None:
         track.add(Pose.model_validate({"stamp_ns": 2, "seq": 2, "status": "dead_reckoned", **values}), 2) is Step.LOST
     )
     assert track.lost
+
+
+def test_a_dead_fusion_is_a_dead_slam(quick: World) -> None:
+    """Its health was heard and is old, and no pose comes."""
+    world = copy.deepcopy(quick)
+    world._seen_ns["fusion"] = world.now_ns - 4_000_000_000
+    world.slam = None
+    assert world.run("hold", seconds=1.0) == "hold"
+    assert "fusion is dead or hung" in world.mission.reason
+    assert world.run("landing", seconds=5.0) == "landing"
