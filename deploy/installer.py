@@ -6,6 +6,7 @@ Standard library only: it runs before anything is installed.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import os
 import re
 import resource
@@ -28,6 +29,9 @@ COMMAND = "usr/local/bin/treedock"
 MEMORY_LOCK = f"{UNIT_FOLDER}/treedock-.service.d/10-memory-lock.conf"
 BOOTED = Path("/run/systemd/system")
 """There while systemd runs this machine (man sd_booted)."""
+STAMP = "share/treedock/source.sha256"
+"""Below the prefix: what was installed, by its bytes."""
+KERNELS = f"var/cache/{USER}/numba"
 RULES = "etc/udev/rules.d/60-treedock.rules"
 _MIN_PYTHON = (3, 11)
 _CAP_IPC_LOCK = 1 << 14
@@ -97,7 +101,7 @@ def _user() -> Iterator[Action]:
         ("useradd", "--system", "--home-dir", f"/var/lib/{USER}", "--shell", "/usr/sbin/nologin", "--user-group", USER),
         "the one user of all services", needed=not known,
     )  # fmt: skip
-    for folder in (f"/var/lib/{USER}", f"/var/cache/{USER}", f"/var/cache/{USER}/numba"):
+    for folder in (f"/var/lib/{USER}", f"/var/cache/{USER}"):
         yield Folder(Path(folder), 0o750, USER)
 
 
@@ -120,18 +124,39 @@ def _environment(options: Options) -> Iterator[Action]:
     python = str(prefix / "bin/python")
     yield Run((sys.executable, "-m", "venv", str(prefix)), "a private environment", needed=not Path(python).exists())
     offline = ("--no-index", "--find-links", str(options.wheels)) if options.wheels else ()
+    stamp, wanted = prefix / STAMP, source_hash()
+    changed = not stamp.is_file() or stamp.read_text() != wanted
+    if changed:
+        yield Remove(stamp)  # an attempt that is broken off is no installation
+        # numba asks whether a kernel's own file changed, not those of the kernels compiled into it
+        yield Remove(options.at(KERNELS))
+    if options.live:
+        yield Folder(options.at(KERNELS), 0o750, USER)
     yield Run(
         (python, "-m", "pip", "install", "-q", "--disable-pip-version-check", *offline, "-c",
          str(SOURCE / "constraints.txt"), str(SOURCE)),
-        "treedock and its pinned packages",
+        "treedock and its pinned packages", needed=changed,
     )  # fmt: skip
     if options.role == "aircraft" and not options.no_realsense:
         yield Run(
             (python, "-m", "pip", "install", "-q", "--disable-pip-version-check", *offline, "-c",
              str(SOURCE / "constraints.txt"), "pyrealsense2"),
             "the RealSense camera's library; where there is no wheel (ARM), build librealsense with its Python bindings",
-            may_fail=True,
+            needed=next(prefix.glob("lib/python*/site-packages/pyrealsense2"), None) is None, may_fail=True,
         )  # fmt: skip
+    yield Write(stamp, wanted)
+
+
+def source_hash(source: Path = SOURCE) -> str:
+    """Return a hash of all that is installed: sources, their names, and what is pinned."""
+    digest = hashlib.sha256()
+    files = [source / name for name in ("pyproject.toml", "constraints.txt")]
+    for package in ("schemas", "services"):
+        files += [path for path in (source / package).rglob("*") if path.is_file() and "__pycache__" not in path.parts]
+    for path in sorted(files):
+        content = path.read_bytes()
+        digest.update(f"{path.relative_to(source)} {len(content)}\n".encode() + content)
+    return digest.hexdigest()
 
 
 def _activation(options: Options) -> Iterator[Action]:

@@ -165,6 +165,47 @@ def test_again_changes_nothing_and_keeps_the_administrators_file(tmp_path: Path)
     assert own.read_text() == 'uav = "mine"\n'
 
 
+def runs(tmp_path: Path) -> list[str]:
+    """The commands that would be run now."""
+    actions_now = installer.installation(options(tmp_path, "--no-realsense"))
+    return [" ".join(a.command) for a in actions_now if isinstance(a, actions.Run) and a.needed]
+
+
+def test_packages_are_installed_again_only_when_something_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And the kernels are compiled anew then: numba looks at a kernel's own file, not at those of the kernels inside it."""
+    assert any("pip install" in command for command in runs(tmp_path))
+    staged(tmp_path)
+    kernels = tmp_path / "var/cache/treedock/numba/services.abc/kernel.nbc"
+    kernels.parent.mkdir(parents=True)
+    kernels.write_bytes(b"compiled")
+    staged(tmp_path)
+    assert kernels.exists()
+    assert not any("pip install" in command for command in runs(tmp_path))
+    monkeypatch.setattr(installer, "source_hash", lambda: "another")
+    assert any("pip install" in command for command in runs(tmp_path))
+    staged(tmp_path)
+    assert not kernels.exists()
+
+
+def test_the_source_is_known_by_every_byte_and_name(tmp_path: Path) -> None:
+    for name in ("pyproject.toml", "constraints.txt", "schemas/a.py", "services/x/b.py"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(name)
+    seen = {installer.source_hash(tmp_path)}
+    (tmp_path / "services/x/b.py").write_text("services/x/c.py")
+    seen.add(installer.source_hash(tmp_path))
+    (tmp_path / "services/x/b.py").rename(tmp_path / "services/x/d.py")
+    seen.add(installer.source_hash(tmp_path))
+    (tmp_path / "constraints.txt").write_text("numpy==2")
+    seen.add(installer.source_hash(tmp_path))
+    assert len(seen) == 4
+    (tmp_path / "services/x/__pycache__").mkdir()
+    (tmp_path / "services/x/__pycache__/d.pyc").write_text("made by Python")
+    assert installer.source_hash(tmp_path) in seen
+
+
 def test_another_prefix_reaches_the_units(tmp_path: Path) -> None:
     staged(tmp_path, "--prefix", "/usr/local/treedock")
     text = (tmp_path / "etc/systemd/system/treedock-slam.service").read_text()
