@@ -137,7 +137,11 @@ def measure(flight: Flight, setup: str, after_s: float) -> dict[str, Any]:
         row |= _on_earth(judged.earth_m, len(judged.earth_m) - len(heard) + round(after_s * FRAME_HZ))
         told_s = _caught_s(fuser.gps.caught_ns, flight.flown)
         row |= {"caught_s": told_s, "used": fuser.gps.used, "refused": fuser.gps.refused}
-    row |= {"ms": round(1e3 * spent_s / len(heard), 3), "restarts": fuser.restarts, "contradicted": fuser.contradicted}
+    row |= {
+        "ms": round(1e3 * spent_s / len(heard), 3),
+        "restarts": fuser.restarts,
+        "contradicted": fuser.guard.contradicted,
+    }
     return row
 
 

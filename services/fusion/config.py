@@ -103,5 +103,7 @@ class FusionConfig(BaseModel):
     jump_m: float = Field(default=0.12, gt=0.0)
     """Slam's step and the IMU's from one state to the next differ by at most this, or five of their standard deviations."""
     jump_rad: float = Field(default=math.radians(3.0), gt=0.0)
+    apart_m: float = Field(default=1.0, gt=0.0)
+    """Farther apart than this nobody knows which of the two is wrong: no pose is told."""
     believe_again_s: float = Field(default=0.7, gt=0.0)
     """A place slam jumped to, and stays at for so long, is taken over with a new ``reset_counter``."""

@@ -15,9 +15,10 @@ from schemas.fusion import Carrier
 from services.common.geometry import Matrix, inverse, rotation_z
 from services.fusion.config import FusionConfig
 from services.fusion.gps import GpsDesk
-from services.fusion.inertial import Inertial
+from services.fusion.guard import Guard
+from services.fusion.inertial import IMU_LATE_NS, Inertial
 from services.fusion.second_eye import SecondEye
-from services.fusion.sight import Doubt, Sight, contradicts
+from services.fusion.sight import Sight
 from services.fusion.smoother import Smoother, State
 from services.fusion.values import (
     Fused,
@@ -36,10 +37,8 @@ _RIPE_S = 1.0
 """Velocity and bias are known after this; before, the IMU contradicts nobody."""
 _WALK_M_S = 1.0
 _NONE = -1
-_IMU_LATE_NS = 300_000_000
-"""Samples that are late by less come yet; beyond, the window goes on without."""
-_IMU_BACK_NS = 300_000_000
-"""An IMU that has told so much without a gap is taken in again."""
+_IMU_BEGIN_NS, _IMU_BACK_NS = 50_000_000, 300_000_000
+"""An IMU that has told so much without a gap is begun with, or taken in again."""
 
 
 @dataclass(slots=True)
@@ -59,11 +58,13 @@ class Fuser:
         self.inertial = Inertial(config.imu_noise)
         self.gps: GpsDesk | None = GpsDesk(config) if config.gps else None
         self.smoother: Smoother | None = None
-        self.restarts = self.jumps_announced = self.contradicted = 0
+        self.restarts = self.jumps_announced = 0
         self.resets = 0
         """Added to slam's own reset counter: jumps that slam did not tell."""
         self._anchor: _Anchor | None = None
-        self._doubt = Doubt(config)
+        self.guard = Guard(config, T_body_camera)
+        self._pending: Located | None = None
+        """A frame that is to become a state once the IMU has told of its time."""
         self._first = Sight()
         self._eye = None if T_body_second is None else SecondEye(T_body_second)
         self._began_ns = -1
@@ -89,11 +90,14 @@ class Fuser:
             return None if located is None else self._begin(located)
         if stamp_ns <= self.smoother.last.stamp_ns:
             return self._as_told(located)
+        self._catch_up()
         if not self._felt(stamp_ns):
-            late = stamp_ns - self.inertial.newest_ns < _IMU_LATE_NS and self.smoother.inertial
-            return self._as_told(located) if late else self._restart(located)
+            late = self.smoother.inertial and self._imu_wanted(stamp_ns)
+            late = late and stamp_ns - self.inertial.newest_ns < IMU_LATE_NS
+            return self._late(located) if late else self._restart(located)
         if located is not None and self._contradicted(located):
-            located = None
+            carried = self._carry(stamp_ns)
+            return carried if self.guard.apart_m <= self.config.apart_m else None
         if located is not None:
             return self._follow(located)
         return self._carry(stamp_ns) if self.smoother.inertial else None
@@ -120,18 +124,40 @@ class Fuser:
             return None
         return self._carry(stamp_ns) if self.inertial.covers(s.last.stamp_ns, stamp_ns) else None
 
+    def _late(self, located: Located | None) -> Fused | None:
+        """Tell a pose at once although the IMU's samples of that moment are still to come."""
+        if located is None:
+            return self.silence(self.inertial.newest_ns)
+        self._pending = located
+        return self._as_told(located)
+
+    def _catch_up(self) -> None:
+        """Make a state of the frame that was too early for the IMU."""
+        pending, self._pending = self._pending, None
+        s = self.smoother
+        if (
+            pending is not None
+            and s is not None
+            and pending.stamp_ns > s.last.stamp_ns
+            and self._felt(pending.stamp_ns)
+        ):
+            self._follow(pending)
+
     def _felt(self, stamp_ns: int) -> bool:
         """Whether the window can go on to a moment: the IMU has told all of the time, or none of it is looked for."""
         s = self.smoother
         assert s is not None
         if s.inertial:
-            return self.inertial.covers(s.last.stamp_ns, stamp_ns)
-        return not (self.config.imu and self.inertial.covers(stamp_ns - _IMU_BACK_NS, stamp_ns))
+            return self._imu_wanted(stamp_ns) and self.inertial.covers(s.last.stamp_ns, stamp_ns)
+        return not (self._imu_wanted(stamp_ns) and self.inertial.flows(stamp_ns, _IMU_BACK_NS))
+
+    def _imu_wanted(self, stamp_ns: int) -> bool:
+        return self.config.imu and stamp_ns >= self.guard.banned_until_ns
 
     # -- the located camera -------------------------------------------------------------------------------------
     def _begin(self, located: Located, T_W_body: Matrix | None = None, velocity: Matrix | None = None) -> Fused:
         """Start a window at a located frame; W is the map, or goes on where the last window ended."""
-        with_imu = self.config.imu and self.inertial.covers(located.stamp_ns - 50_000_000, located.stamp_ns)
+        with_imu = self._imu_wanted(located.stamp_ns) and self.inertial.flows(located.stamp_ns, _IMU_BEGIN_NS)
         s = Smoother(self.config, self.inertial if with_imu else None)
         if T_W_body is None:
             T_W_body = located.T_map_camera @ inverse(self._T_body_camera)
@@ -141,7 +167,7 @@ class Fuser:
         self._began_ns = located.stamp_ns
         if self._eye is not None:
             self._eye.begin()
-        self._doubt.clear()
+        self.guard.begin()
         self._solve()
         return self._as_told(located)  # type: ignore[return-value]
 
@@ -198,32 +224,17 @@ class Fuser:
     def _contradicted(self, located: Located) -> bool:
         """Whether the IMU says that the camera cannot be where slam says; what slam keeps to is believed in the end."""
         s, anchor = self._window()
-        ripe = (located.stamp_ns - self._began_ns) * 1e-9 >= _RIPE_S
+        ripe = s.inertial and (located.stamp_ns - self._began_ns) * 1e-9 >= _RIPE_S
         told = located.epoch[1] != anchor.located.epoch[1] and not self._blind
-        if (
-            not (s.inertial and ripe)
-            or located.epoch[0] != anchor.located.epoch[0]
-            or told
-            or not s.holds(anchor.index)
-        ):
+        if not ripe or told or located.epoch[0] != anchor.located.epoch[0] or not s.holds(anchor.index):
             return False
-        felt = Moved(inverse(s.state(anchor.index).T_W_body) @ s.predict(located.stamp_ns), self._felt_covariance())
-        if not contradicts(relative(anchor.located, located, self._T_body_camera), felt, self.config):
-            self._doubt.clear()
-            return False
-        if not self._doubt.stands(located):
-            self.contradicted += 1
-            return True
-        self._doubt.clear()
-        if located.epoch == anchor.located.epoch:
-            self.resets += 1
-            self.jumps_announced += 1
-        self._anchor = _Anchor(_NONE, located)  # nothing joins the two places
-        return False
-
-    def _felt_covariance(self) -> Matrix:
-        s, anchor = self._window()
-        return s.moved(anchor.index, s.last.index).covariance if anchor.index != s.last.index else np.zeros((6, 6))
+        verdict = self.guard.judge(s, anchor.index, anchor.located, located)
+        if verdict == "taken":
+            untold = located.epoch == anchor.located.epoch
+            self.resets += untold
+            self.jumps_announced += untold
+            self._anchor = _Anchor(_NONE, located)  # nothing joins the two places
+        return verdict == "refused"
 
     # -- without the first camera -------------------------------------------------------------------------------
     def _carry(self, stamp_ns: int) -> Fused | None:

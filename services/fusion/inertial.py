@@ -12,6 +12,8 @@ from services.fusion.config import ImuNoiseConfig
 from services.fusion.values import ImuReading
 
 GRAVITY_M_S2 = 9.80665
+IMU_LATE_NS = 300_000_000
+"""Readings that are late by less come yet."""
 _KEPT = 1_500
 _AHEAD_NS = 40_000_000
 """The last reading stands for at most so long after it."""
@@ -53,6 +55,11 @@ class Inertial:
             if last_ns >= to_ns:
                 return True
         return last_ns is not None and to_ns - last_ns <= _AHEAD_NS and last_ns >= from_ns - _AHEAD_NS
+
+    def flows(self, stamp_ns: int, long_ns: int) -> bool:
+        """Whether readings come, about a moment and without a gap for so long: those of the moment itself may come yet."""
+        near = abs(stamp_ns - self.newest_ns) < IMU_LATE_NS
+        return near and self.covers(self.newest_ns - long_ns, self.newest_ns)
 
     def between(self, from_ns: int, to_ns: int, bias: Any) -> Any:  # noqa: ANN401 - gtsam has no types
         """Return gtsam's combined preintegrated measurement over ``(from_ns, to_ns]`` about ``bias``."""

@@ -118,9 +118,13 @@ class FusionService:
             jumps_announced=f.jumps_announced,
         ))  # fmt: skip
         c.health.counters["restarts"] = f.restarts
-        c.health.counters["contradicted"] = f.contradicted
+        c.health.counters["contradicted"] = f.guard.contradicted
         late = self._config.imu and now_ns - max(self._imu_ns, self._begun_ns) > _IMU_SILENT_S * 1e9
         c.health.note("imu", "no samples from the autopilot: does it send HIGHRES_IMU on this link?" if late else "")
+        if now_ns < f.guard.banned_until_ns:
+            c.health.note(
+                "imu", "left out: slam kept to what it contradicted; look at the camera's mount, and at vibration"
+            )
         c.health.note("gps", f"not believed: {word}" if word else "")
 
     def _tell(self, fused: Fused | None, slam: Pose) -> None:

@@ -26,7 +26,9 @@ def true_body(t_s: float) -> Matrix:
     return pose(rotation_z(0.5 * np.sin(0.4 * t)) @ tilt, place)
 
 
-def reading(t_s: float, period_s: float, rng: np.random.Generator | None = None, bias: float = 0.0) -> ImuReading:
+def reading(
+    t_s: float, period_s: float, rng: np.random.Generator | None = None, bias: float = 0.0, wild: float = 1.0
+) -> ImuReading:
     """Return the mean rate and force over the period that ends at ``t_s``."""
     a, b = true_body(t_s - period_s), true_body(t_s)
     gyro = log_rotation(a[:3, :3].T @ b[:3, :3]) / period_s
@@ -34,7 +36,7 @@ def reading(t_s: float, period_s: float, rng: np.random.Generator | None = None,
     before, here, after = (true_body(middle + d)[:3, 3] for d in (-10 * _STEP_S, 0.0, 10 * _STEP_S))
     acceleration = (before - 2.0 * here + after) / (10 * _STEP_S) ** 2
     force = true_body(middle)[:3, :3].T @ (acceleration + np.array([0.0, 0.0, GRAVITY_M_S2]))
-    noise = np.zeros(6) if rng is None else rng.standard_normal(6) * np.repeat([0.004, 0.18], 3)
+    noise = np.zeros(6) if rng is None else wild * rng.standard_normal(6) * np.repeat([0.004, 0.18], 3)
     return ImuReading(stamp_ns(t_s), gyro + noise[:3] + 0.05 * bias, force + noise[3:] + bias)
 
 

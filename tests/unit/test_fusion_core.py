@@ -22,7 +22,7 @@ Sees = Callable[[float, np.random.Generator], Located | None]
 
 def fly(
     seconds: float, sees: Sees, config: FusionConfig | None = None, *, imu: Callable[[float], bool] = lambda _: True,
-    second: Sees | None = None,
+    second: Sees | None = None, late_s: float = 0.0, wild: float = 1.0,
 ) -> tuple[list[tuple[float, Fused | None]], Fuser]:  # fmt: skip
     """Run a flight: readings, frames of the first and of the second camera in order; returns what was told when."""
     config = config or FusionConfig()
@@ -30,8 +30,8 @@ def fly(
     rng, frames, told = np.random.default_rng(7), 0, []
     for k in range(-25, round(seconds / PERIOD_S)):
         t_s = k * PERIOD_S
-        if imu(t_s):
-            fuser.imu(reading(t_s, PERIOD_S, rng, bias=0.06))
+        if imu(t_s - late_s):
+            fuser.imu(reading(t_s - late_s, PERIOD_S, rng, bias=0.06, wild=wild))
         if t_s < frames * FRAME_S:
             continue
         at_s = frames * FRAME_S
@@ -131,7 +131,7 @@ def test_a_located_pose_is_slams_own() -> None:
     told, fuser = fly(4.0, sees_all)
     rng = np.random.default_rng(7)
     assert all(f is not None and f.carrier == "camera" for _, f in told)
-    assert fuser.restarts == fuser.contradicted == 0
+    assert fuser.restarts == fuser.guard.contradicted == 0
     del rng
     fused = told[-1][1]
     assert fused is not None
@@ -175,7 +175,7 @@ def test_a_short_jump_of_slam_is_not_told() -> None:
         return located(t_s, rng, shift_m=0.4 if 4.0 <= t_s < 4.4 else 0.0)
 
     told, fuser = fly(6.0, sees)
-    assert fuser.contradicted > 0
+    assert fuser.guard.contradicted > 0
     assert fuser.jumps_announced == 0
     assert max(error_m(t, f) for t, f in told if f is not None) < 0.1
     assert all(f is not None for _, f in told)
@@ -207,6 +207,22 @@ def test_a_gap_of_the_imu_begins_a_new_window_and_poses_go_on() -> None:
     assert fuser.restarts >= 1
     assert all(f is not None for _, f in told)
     assert {f.carrier for t, f in told if f is not None and 7.5 <= t < 8.0} == {"imu"}
+
+
+def test_samples_that_come_late_serve_all_the_same() -> None:
+    """The IMU's samples arrive 90 ms after slam's poses of the same moment."""
+    told, fuser = fly(6.0, dark(5.0, 6.0), late_s=0.09)
+    carried_poses = [(t, f) for t, f in told if f is not None and f.carrier == "imu"]
+    assert len(carried_poses) >= 10
+    assert max(error_m((f.stamp_ns - stamp_ns(0.0)) * 1e-9, f) for _, f in carried_poses) < 0.12
+    assert fuser.restarts == 0
+
+
+def test_an_imu_that_lies_is_left_out_in_the_end() -> None:
+    told, fuser = fly(9.0, sees_all, wild=300.0)
+    assert fuser.guard.banned_until_ns > 0
+    assert all(f is not None and f.carrier == "camera" for t, f in told if t > 7.0)
+    assert max(error_m(t, f) for t, f in told if f is not None) < 1.1
 
 
 def test_the_second_camera_carries_the_pose_through_a_long_blackout() -> None:
