@@ -28,6 +28,8 @@ BENCHES: dict[str, str] = {
     "depth": "services.evaluate.bench_depth",
     "missions": "services.evaluate.bench_missions",
     "avoid": "services.evaluate.bench_avoid",
+    "fleet": "services.evaluate.bench_fleet",
+    "fleet-capacity": "services.evaluate.bench_fleet_capacity",
     "system": "services.evaluate.bench_system",
     "station": "services.evaluate.bench_station",
     "faults": "services.evaluate.bench_faults",

@@ -6,7 +6,7 @@ One thread, faster than real time, the same every time.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -14,9 +14,10 @@ from schemas.navigation import MissionStateName
 from schemas.slam import Pose
 from schemas.trees import Target, TreeList
 from schemas.vehicle import VehicleState
-from services.common.geometry import Matrix, camera_yaw, pose, wrap_angle
+from services.common.geometry import Matrix, camera_yaw, pose, rotation_z, wrap_angle
 from services.evaluate.eyes import Round, see
 from services.evaluate.synthetic import ChainErrors, SyntheticChain, TrueTrunk
+from services.fleet.holder import ClaimView, Wish
 from services.navigator.autopilot.bridge import Bridge
 from services.navigator.autopilot.config import AutopilotConfig
 from services.navigator.autopilot.link import Codec
@@ -68,8 +69,23 @@ class FlightCase:
     things: tuple[Round, ...] = ()
     """What stands there and no detector tells: bushes, people."""
     walkers: tuple[Walker, ...] = ()
+    start_m: tuple[float, float] = (0.0, 0.0)
+    start_yaw_rad: float = 0.0
+    """Of the first view: the map's x axis."""
     navigator: NavigatorConfig = field(default_factory=NavigatorConfig)
     autopilot: AutopilotConfig = field(default_factory=AutopilotConfig)
+
+
+class Desk(Protocol):
+    """The aircraft's claims on trees, among several (``services.evaluate.fleet_flight``)."""
+
+    def view(self) -> ClaimView:
+        """Return what the mission is to know now."""
+        ...
+
+    def follow(self, wish: Wish) -> None:
+        """Take what a step of the mission wants."""
+        ...
 
 
 @dataclass
@@ -90,17 +106,21 @@ class Flight:
     silent: set[str] = field(default_factory=set)
     """Services without health."""
     setpoints: list[tuple[int, Any]] = field(default_factory=list)
+    desk: Desk | None = None
+    others: list[Round] = field(default_factory=list)
+    """Other aircraft in the air, where they are now."""
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng(self.case.seed)
-        T = pose(np.eye(3), (0.0, 0.0, 0.1))
+        R_start = rotation_z(self.case.start_yaw_rad)
+        T = pose(R_start, (*self.case.start_m, 0.1))
         config = Px4Config(wind=self.case.wind)
         self.px4 = SimulatedPx4(_flat, T, config, int(rng.integers(2**31)))
         self.mission = Mission(self.case.navigator)
         self.bridge = Bridge(self.case.autopilot)
         self.codec = Codec(self.case.autopilot.component_id, 1, lambda: self.now_ns)
         self._link = InProcessLink(self.px4, self.codec)
-        T_world_map = pose(np.eye(3), self._camera()[:3, 3])
+        T_world_map = pose(R_start, self._camera()[:3, 3])
         self.chain = SyntheticChain(self.case.trunks, T_world_map, self.case.errors, rng)
         self._eyes_rng = np.random.default_rng([self.case.seed, 79])
         self._view: Seen[View] | None = None
@@ -189,8 +209,11 @@ class Flight:
 
     def _run_mission(self) -> None:
         services = {name: self.now_ns for name in _SERVICES if name not in self.silent}
-        inputs = Inputs(self.now_ns, self._pose, self._trees, self._target, self._vehicle, services, self._view)
+        inputs = Inputs(self.now_ns, self._pose, self._trees, self._target, self._vehicle, services, self._view,
+                        claims=None if self.desk is None else self.desk.view())  # fmt: skip
         self.outputs = self.mission.step(inputs)
+        if self.desk is not None:
+            self.desk.follow(self.outputs.wish)
         self.events.extend(self.outputs.events)
         for event in self.outputs.events:
             if event.after == "approach" and not self._approach_ns:
@@ -209,7 +232,9 @@ class Flight:
         T = track.predict(self.now_ns)
         true = self._T_world_map_inverse @ self._camera()
         things = [Round(*self._in_map(t.x_m, t.y_m), t.radius_m) for t in self.case.trunks]
-        things += [Round(*self._in_map(t.x_m, t.y_m), t.radius_m) for t in (*self.people(), *self.case.things)]
+        things += [
+            Round(*self._in_map(t.x_m, t.y_m), t.radius_m) for t in (*self.people(), *self.case.things, *self.others)
+        ]
         key = (last.map_id, last.reset_counter)
         view = see(things, true[:2, 3], camera_yaw(true), T[:3, 3], camera_yaw(T), self.now_ns, key, self._eyes_rng)
         self._view = Seen(view, self.now_ns)
@@ -270,7 +295,7 @@ def random_case(seed: int, clutter: int = 6, navigator: NavigatorConfig | None =
         thick = len(trunks) > 1 and rng.random() < 0.2
         radius = float(rng.uniform(0.25, 0.4) if thick else rng.uniform(0.05, 0.19))
         _plant(trunks, TrueTrunk(*_polar(distance, angle), radius, suitable=not thick))
-    return FlightCase(seed, tuple(trunks), wind=_weather(rng), navigator=navigator or NavigatorConfig())
+    return FlightCase(seed, tuple(trunks), wind=weather(rng), navigator=navigator or NavigatorConfig())
 
 
 def obstacle_case(seed: int, navigator: NavigatorConfig | None = None) -> FlightCase:
@@ -290,7 +315,7 @@ def obstacle_case(seed: int, navigator: NavigatorConfig | None = None) -> Flight
             break
         place = _polar(float(rng.uniform(2.0, 5.5)), angle + float(rng.uniform(-1.2, 1.2)))
         _plant(trunks, TrueTrunk(*place, float(rng.uniform(0.22, 0.35)), suitable=False))
-    return FlightCase(seed, tuple(trunks), wind=_weather(rng), navigator=navigator or NavigatorConfig())
+    return FlightCase(seed, tuple(trunks), wind=weather(rng), navigator=navigator or NavigatorConfig())
 
 
 def _polar(distance_m: float, angle_rad: float) -> tuple[float, float]:
@@ -303,5 +328,6 @@ def _plant(trunks: list[TrueTrunk], new: TrueTrunk) -> None:
         trunks.append(new)
 
 
-def _weather(rng: np.random.Generator) -> WindConfig:
+def weather(rng: np.random.Generator) -> WindConfig:
+    """Return a wind of up to 1.5 m/s with gusts."""
     return WindConfig(mean_m_s=float(rng.uniform(0.0, 1.5)), gust_m_s=float(rng.uniform(0.2, 0.8)))

@@ -23,8 +23,10 @@ if TYPE_CHECKING:
 class Ground:
     """Router and station as processes of their own, in a folder."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, settings: tuple[str, ...] = ()) -> None:
+        """Make it; ``settings`` of the station, ``name=value``."""
         self.folder = folder
+        self._settings = [part for setting in settings for part in ("--set", setting)]
         self.port, self.page_port = free_port(), free_port()
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
 
@@ -46,7 +48,7 @@ class Ground:
     def start(self, name: str) -> None:
         """Start the router or the station."""
         more = [] if name == "router" else ["--page-port", str(self.page_port), "--set",
-                                            f"station.inventory.database={self.database}"]  # fmt: skip
+                                            f"station.inventory.database={self.database}", *self._settings]  # fmt: skip
         command = [sys.executable, "-m", "services.cli.app", name, "--port", str(self.port), *more]
         with (self.folder / f"{name}.log").open("ab") as log:
             self.processes[name] = subprocess.Popen(command, stdout=log, stderr=log)
@@ -111,6 +113,8 @@ class Page:
         self._socket = page_socket(ground.address)
         self._socket.send(json.dumps({"t": "hello", "secret": "b" * 24, "name": "bench"}))
         self.trees: dict[str, int] = {}
+        self.states = 0
+        """How often it was told the state of all aircraft."""
         self.links: dict[str, str] = {}
 
     def hear(self, timeout_s: float) -> None:
@@ -120,6 +124,7 @@ class Page:
         if body["t"] == "trees":
             self.trees[body["uav"]] = len(body["rows"])
         elif body["t"] == "state":
+            self.states += 1
             self.links = {view["uav"]: view["link"] for view in body["aircraft"]}
 
     def right(self, aircraft: int, trees: int) -> bool:

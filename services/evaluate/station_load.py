@@ -10,9 +10,10 @@ from typing import Self
 import msgpack
 import numpy as np
 
+from schemas.health import Health
 from schemas.navigation import MissionState
 from schemas.slam import Pose
-from schemas.topics import MISSION_STATE, SLAM_POSE, TREES_LIST, TREES_TARGET, VEHICLE_STATE
+from schemas.topics import HEALTH, MISSION_STATE, SLAM_POSE, TREES_LIST, TREES_TARGET, VEHICLE_STATE
 from schemas.trees import Target, Tree, TreeList
 from schemas.vehicle import VehicleState
 from services.common.bus import Bus
@@ -22,6 +23,7 @@ from services.common.session import opened_client
 
 _VARIANTS = 8
 _SPACING_M = 2.5
+_TICKS_A_SECOND = 5
 
 
 def grown_trees(count: int, rng: np.random.Generator) -> list[Tree]:
@@ -41,8 +43,11 @@ def grown_trees(count: int, rng: np.random.Generator) -> list[Tree]:
 class FakeAircraft:
     """One aircraft's radio traffic. The lists are packed beforehand: the load must not be the measurement."""
 
-    def __init__(self, bus: Bus, number: int, trees: int, seed: int) -> None:
+    def __init__(self, bus: Bus, number: int, trees: int, seed: int, list_every: int = 1, services: int = 0) -> None:
+        """Make one; it tells its list every so many ticks, and of so many ``services`` their health once a second."""
         self.bus = bus
+        self._list_every, self._services = list_every, services
+        self._health_phase = number
         self.sent = 0
         self.version = 0
         self.told: list[tuple[float, int]] = []
@@ -87,8 +92,22 @@ class FakeAircraft:
             sigma_radius_m=None, raw_image_x_px=None, raw_range_m=None, raw_radius_m=None, position_map_m=None,
             covariance_map_m2=None,
         ))  # fmt: skip
-        self._send_trees(stamp_ns)
-        self.sent += 5
+        self.sent += 4
+        if step % self._list_every == 0:
+            self._send_trees(stamp_ns)
+            self.sent += 1
+        if self._services and (step + self._health_phase) % _TICKS_A_SECOND == 0:
+            self._send_health(stamp_ns, step)
+
+    def _send_health(self, stamp_ns: int, step: int) -> None:
+        for k in range(self._services):
+            name = f"service{k}"
+            self.bus.publish(HEALTH, Health(
+                service=name, stamp_ns=stamp_ns, seq=step // _TICKS_A_SECOND, state="ready", pid=1, uptime_s=1.0,
+                counters={"frames": step, "decode_errors": 0}, rates_hz={"slam/pose": 15.0, "trees/target": 15.0},
+                work_ms={"step": 1.2}, version="bench",
+            ), name)  # fmt: skip
+        self.sent += self._services
 
     def _send_trees(self, stamp_ns: int) -> None:
         self.version += 1
@@ -103,12 +122,16 @@ class FakeAircraft:
 class Load:
     """Many aircraft on sessions of their own, sent by one thread; a context manager."""
 
-    def __init__(self, endpoint: str, aircraft: int, rate_hz: float, trees: int, seed: int) -> None:
+    def __init__(
+        self, endpoint: str, aircraft: int, rate_hz: float, trees: int, seed: int, list_every: int = 1, services: int = 0
+    ) -> None:  # fmt: skip
         self._stack = ExitStack()
         self.aircraft: list[FakeAircraft] = []
         for number in range(1, aircraft + 1):
             session = self._stack.enter_context(opened_client(endpoint, lambda: False, wait_s=20.0))
-            self.aircraft.append(FakeAircraft(Bus(session, f"uav{number}", HealthBook()), number, trees, seed))
+            self.aircraft.append(FakeAircraft(
+                Bus(session, f"uav{number}", HealthBook()), number, trees, seed, list_every, services
+            ))  # fmt: skip
         self._period_s = 1.0 / rate_hz
         self._step = 0
         self._running = threading.Event()

@@ -7,6 +7,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
+from services.evaluate.fleet_link import LinkFaults
 from tests.fleet.lease_net import STEP_NS, Net, goal
 
 _RATE = st.sampled_from([0.99, 1.0, 1.01, 0.995])
@@ -26,7 +27,7 @@ class Leases(RuleBasedStateMachine):
     @rule(steps=st.integers(1, 120))
     def pass_time(self, steps: int) -> None:
         for _ in range(steps):
-            self.net.step()
+            self.net.pass_step()
 
     @rule(who=_WHO, tree=_TREE, again=st.booleans())
     def wish(self, who: int, tree: int, again: bool) -> None:
@@ -59,7 +60,7 @@ class Leases(RuleBasedStateMachine):
     def arbiter_starts(self) -> None:
         if not self.memory:
             self.net.disk = None
-        self.net.start_arbiter()
+        self.net.start_arbiter(self.net.now_ns)
         self.pass_time(10)
 
     def teardown(self) -> None:
@@ -67,9 +68,9 @@ class Leases(RuleBasedStateMachine):
         if not hasattr(self, "net"):
             return
         net = self.net
-        net.cut, net.loss, net.most_delay_ns = set(), 0.0, STEP_NS
+        net.cut, net.faults = set(), LinkFaults(0.0, STEP_NS)
         if not net.alive:
-            net.start_arbiter()
+            net.start_arbiter(net.now_ns)
         for flying in net.fleet:
             flying.holder.release()
         self.pass_time(220)  # the longest delay, and a lease

@@ -36,8 +36,8 @@ def live(seed: int, steps: int = _STEPS) -> Net:
             net.alive, down_until = False, step + rng.randrange(1, 30)
             net.disk = None if seed % 2 else net.disk
         if not net.alive and step >= down_until:
-            net.start_arbiter()
-        net.step()
+            net.start_arbiter(net.now_ns)
+        net.pass_step()
     return net
 
 
