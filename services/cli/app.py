@@ -14,6 +14,7 @@ import typer
 
 from services.cli.certs import certs_app
 from services.cli.config_command import config
+from services.cli.fleet import fleet_app
 from services.cli.inventory import inventory_app
 from services.cli.run import run
 from services.cli.service_command import OPTIONAL, SERVICES, service_command
@@ -62,6 +63,7 @@ def make_app() -> typer.Typer:
             app.command(name)(getattr(module, name))
     app.add_typer(topic_app, name="topic")
     app.add_typer(inventory_app, name="inventory")
+    app.add_typer(fleet_app, name="fleet")
     app.add_typer(certs_app, name="certs")
     app.command()(config)
     for name, about in (SERVICES | OPTIONAL).items():

@@ -97,14 +97,6 @@ class Book:
             return self._reply(request, None, _vague(uav, way.sigma_m, self.rules.max_sigma_m))
         return self._claim(uav, request, way, now_ns)
 
-    def forget_done(self, near: Vec2 | None = None, within_m: float = 0.0) -> int:
-        """Let trees be visited again, all or those near a place; return how many. The operator's word alone does this."""
-        kept = [d for d in self.done if near is not None and math.dist(d.at_m, near) > within_m]
-        gone, self.done = len(self.done) - len(kept), kept
-        if gone:
-            self.remember(self._memory())
-        return gone
-
     # -- judging
 
     def _claim(self, uav: str, request: ClaimRequest, way: Stretch, now_ns: int) -> ClaimReply:

@@ -16,10 +16,17 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from services.common.errors import InputError
 from services.common.files import make_folder, write_whole
 from services.fleet.book import Memory
+from services.fleet.config import FleetConfig
+from services.inventory.store import default_path
 
 LOG = logging.getLogger(__name__)
 
 Origin = tuple[float, float, float]
+
+
+def book_path(config: FleetConfig) -> Path:
+    """Return where the book lies."""
+    return Path(config.book).expanduser() if config.book else default_path().with_name("fleet.json")
 
 
 class _File(BaseModel):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from schemas.fleet import ClaimReply, ClaimRequest
@@ -14,10 +13,9 @@ from services.common.bus import Bus
 from services.common.context import HealthBook
 from services.fleet.book import Book
 from services.fleet.config import FleetConfig
-from services.fleet.journal import Journal
+from services.fleet.journal import Journal, book_path
 from services.fleet.placing import SharedFrame
 from services.inventory.config import InventoryConfig
-from services.inventory.store import default_path
 from services.inventory.values import Laid
 from services.station.aircraft import Aircraft
 from services.station.events import EventLevel, EventLog
@@ -41,8 +39,7 @@ class Claims:
         """
         points = inventory.start_points
         origin = (points[0].latitude_deg, points[0].longitude_deg, points[0].altitude_m) if points else None
-        path = Path(config.book).expanduser() if config.book else default_path().with_name("fleet.json")
-        self._journal = Journal(path, origin)
+        self._journal = Journal(book_path(config), origin)
         self._frame = SharedFrame(self._journal.origin_deg, inventory.start_of)
         self._log, self._health, self._laid, self._steady_ns = log, health, laid, steady_ns
         self.book = Book(config, self._journal.name, self._journal.write)
