@@ -183,7 +183,7 @@ def removal(options: Options) -> Iterator[Action]:
         yield Run(("systemctl", "stop", *names), "stop", may_fail=True)
     for name in units.files():
         yield Remove(options.at(f"{UNIT_FOLDER}/{name}"))
-    yield Remove(options.at(MEMORY_LOCK))
+    yield _without(options.at(MEMORY_LOCK))
     yield Remove(options.at(RULES))
     command = options.at(COMMAND)
     if command.is_symlink() and str(command.readlink()) == f"{options.prefix}/bin/treedock":
@@ -194,6 +194,12 @@ def removal(options: Options) -> Iterator[Action]:
             yield Remove(options.at(path))
     if options.live:
         yield Run(("systemctl", "daemon-reload"), "forget the units", may_fail=True)
+
+
+def _without(file: Path) -> Action:
+    """Return what removes a file, with its folder where nothing of the administrator's lies beside it."""
+    alone = file.parent.is_dir() and {path.name for path in file.parent.iterdir()} <= {file.name}
+    return Remove(file.parent if alone else file)
 
 
 def check(options: Options) -> None:

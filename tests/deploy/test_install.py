@@ -280,6 +280,19 @@ def test_uninstall_leaves_configuration_and_data_unless_purged(tmp_path: Path) -
     assert not (tmp_path / "etc/treedock").exists()
 
 
+@pytest.mark.parametrize("own", [False, True])
+def test_uninstall_leaves_no_empty_folder_and_no_drop_in_of_others(tmp_path: Path, *, own: bool) -> None:
+    staged(tmp_path)
+    ours = tmp_path / installer.MEMORY_LOCK
+    ours.parent.mkdir(parents=True, exist_ok=True)
+    ours.touch()
+    if own:
+        (ours.parent / "50-mine.conf").touch()
+    assert installer.main(["uninstall", "--root", str(tmp_path)]) == 0
+    assert not ours.exists()
+    assert ours.parent.exists() == own
+
+
 @pytest.mark.parametrize("arguments", [["--uav", "a b"], ["--uav", ""], ["--prefix", "opt"], ["--uav", "x/../y"]])
 def test_what_cannot_work_is_refused_first(
     tmp_path: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]
