@@ -22,6 +22,21 @@ _MAX_DISTORTION = 1e4
 MIN_DEPTH_SCALE, MAX_DEPTH_SCALE = 0.1, 1e6
 """Units per metre: from 10 m to a micrometre a unit."""
 MAX_ACCEL_MPS2 = 1e5
+DEPTH_AFTER_STEP_NS = 500_000
+_MAX_STEPS = 127
+"""One signed byte of the header; zero in frames from before there was a stamp of depth's own."""
+
+
+def depth_after(colour_ns: int, depth_ns: int) -> int:
+    """Return how long after the colour image the depth image was taken, as a frame carries it.
+
+    Rounded to ``DEPTH_AFTER_STEP_NS``; what is further apart than 63.5 ms comes out as that.
+    """
+    return DEPTH_AFTER_STEP_NS * _steps(depth_ns - colour_ns)
+
+
+def _steps(after_ns: int) -> int:
+    return min(max(round(after_ns / DEPTH_AFTER_STEP_NS), -_MAX_STEPS), _MAX_STEPS)
 
 
 class Intrinsics(Part):
@@ -71,6 +86,9 @@ class RgbdFrame:
     """Below 1: rendered at that share of the size and scaled up (the simulator's reduced mode)."""
     accel_camera: tuple[float, float, float] | None = None
     """Mean specific force since the last frame, m/s^2, camera frame; at rest it points up."""
+    depth_after_ns: int = 0
+    """The depth image's stamp less the colour image's, which is the frame's: a whole number of ``DEPTH_AFTER_STEP_NS``, see
+    ``depth_after``."""
 
     @classmethod
     def encoding(cls) -> str:
@@ -83,7 +101,7 @@ class RgbdFrame:
         accel = self.accel_camera if self.accel_camera is not None else (math.nan,) * 3
         return _HEADER.pack(
             _MAGIC, self.VERSION, COLOUR_ENCODINGS.index(self.colour_encoding),
-            DEPTH_ENCODINGS.index(self.depth_encoding), 0, self.stamp_ns, self.seq,
+            DEPTH_ENCODINGS.index(self.depth_encoding), _steps(self.depth_after_ns), self.stamp_ns, self.seq,
             i.width, i.height, i.fx, i.fy, i.cx, i.cy, i.k1, i.k2, i.p1, i.p2, i.k3, i.depth_scale,
             self.render_scale, *accel, len(self.colour), len(self.depth),
         )  # fmt: skip
@@ -110,7 +128,7 @@ class RgbdFrame:
         if len(view) > cls.MAX_BYTES:
             raise DecodeError(f"rgbd frame of {len(view)} bytes is larger than {cls.MAX_BYTES}")
         values = _HEADER.unpack(view[: _HEADER.size])
-        magic, version, colour_code, depth_code, _ = values[:5]
+        magic, version, colour_code, depth_code, after = values[:5]
         if magic != _MAGIC:
             raise DecodeError("not an rgbd frame: the first four bytes are not TDRF")
         if version != cls.VERSION:
@@ -129,13 +147,14 @@ class RgbdFrame:
             colour=view[_HEADER.size : split], depth=view[split:],
             colour_encoding=COLOUR_ENCODINGS[colour_code], depth_encoding=DEPTH_ENCODINGS[depth_code],
             render_scale=values[19], accel_camera=None if math.isnan(accel[0]) else (accel[0], accel[1], accel[2]),
+            depth_after_ns=after * DEPTH_AFTER_STEP_NS,
         )  # fmt: skip
         _check(frame)
         return frame
 
 
 _MAGIC = b"TDRF"
-_HEADER = struct.Struct("<4sBBBBqQII10dd3dII")
+_HEADER = struct.Struct("<4sBBBbqQII10dd3dII")
 
 
 def _intrinsics(values: tuple[float, ...]) -> Intrinsics:

@@ -51,7 +51,7 @@ class Camera:
     def __init__(self) -> None:
         self.now_ns = 10**18
         self.plugged, self.hung, self.starts, self.stops, self.frame = True, False, 0, 0, 0
-        self.domain = "global_time"
+        self.domain, self.depth_late_ms = "global_time", 0.0
         self.streams: list[tuple[Any, ...]] = []
         self.depth = Sensor({
             "visual_preset": (0, 6, 1), "emitter_enabled": (0, 1, 1), "laser_power": (0, 360, 30),
@@ -74,7 +74,7 @@ class Camera:
         colour = np.broadcast_to(rng.integers(0, 255, (480, 1, 3), dtype=np.uint8), (480, 640, 3)).copy()
         depth = np.full((480, 640), 1500 + self.frame, np.uint16)
         stamp_ms = (self.now_ns - 20_000_000) / 1e6
-        frames = (Frame(colour, stamp_ms, self.domain), Frame(depth, stamp_ms, self.domain))
+        frames = (Frame(colour, stamp_ms, self.domain), Frame(depth, stamp_ms + self.depth_late_ms, self.domain))
         return SimpleNamespace(get_color_frame=lambda: frames[0], get_depth_frame=lambda: frames[1])
 
 

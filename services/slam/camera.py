@@ -42,3 +42,9 @@ def camera_model(intrinsics: Intrinsics, config: SlamConfig) -> CameraModel:
         width=float(i.width), height=float(i.height), cols=grid_size(i)[0], scales=scales, variance=scales**2,
         focal=float(np.sqrt(0.5 * (i.fx**2 + i.fy**2))),
     )  # fmt: skip
+
+
+def distortion_of(intrinsics: Intrinsics) -> F64:
+    """Return (k1, k2, p1, p2, k3) of OpenCV's model."""
+    i = intrinsics
+    return np.array([i.k1, i.k2, i.p1, i.p2, i.k3])

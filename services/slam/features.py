@@ -23,6 +23,8 @@ Bool = NDArray[np.bool_]
 
 CELL_PX = 20.0
 """Side of the search grid's cells."""
+DEPTH_REACH = 10.0
+"""Depth is read up to so many times the range in which it makes map points."""
 _AROUND_PX = 3
 _VOID_PX = 16
 
@@ -168,7 +170,7 @@ class Extractor:
         desc, kept = self._describe(searched, whole, angle, octave)
         xy, angle, octave = xy[kept], angle[kept], octave[kept]
         depth, info, far = sample_depth(
-            depth_m, xy, self._config.min_depth_m, 10.0 * self._config.max_depth_m, self._bf,
+            depth_m, xy, self._config.min_depth_m, DEPTH_REACH * self._config.max_depth_m, self._bf,
             self._config.disparity_sigma_px,
         )  # fmt: skip
         features = self._build(self.undistort(xy), octave, angle, desc, depth, info, far)

@@ -62,3 +62,14 @@ def huber_weight(chi2: float, limit2: float) -> float:
 def huber_cost(chi2: float, limit2: float) -> float:
     """Return Huber's cost for a squared error."""
     return chi2 if chi2 <= limit2 else 2.0 * math.sqrt(chi2 * limit2) - limit2
+
+
+@njit(cache=True, nogil=True)
+def distort(u: float, v: float, camera: F64, distortion: F64, out: F64) -> None:
+    """Write where an undistorted pixel is in the image as taken into ``out`` (2,); ``distortion`` k1, k2, p1, p2, k3 of OpenCV's model."""
+    k1, k2, p1, p2, k3 = distortion[0], distortion[1], distortion[2], distortion[3], distortion[4]
+    x, y = (u - camera[2]) / camera[0], (v - camera[3]) / camera[1]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    out[0] = camera[0] * (x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)) + camera[2]
+    out[1] = camera[1] * (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y) + camera[3]

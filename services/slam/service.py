@@ -18,7 +18,7 @@ from services.slam.maps import LiveMaps, LockstepMap, Maps
 from services.slam.messages import Nodes, pose_message
 from services.slam.results import GraphUpdate, TrackResult
 from services.slam.slam import Slam
-from services.slam.warm import warm
+from services.slam.warm import warm, warm_beside
 
 _JPEG_QUALITY = 80
 _ATTITUDE_AGE_NS = 200_000_000
@@ -29,7 +29,6 @@ _IDLE_PERIODS = 3
 
 def build(context: Context) -> SlamService:
     """Warm the kernels and register the work; the returned service's ``slam`` holds the final trajectory."""
-    warm()
     service = SlamService(context, context.config.slam, _maps(context))
     context.on(CAMERA_COMPRESSED if context.config.slam.frames == "compressed" else CAMERA_RGBD, service.on_frame)
     context.on(VEHICLE_STATE, service.on_vehicle)
@@ -41,9 +40,12 @@ def build(context: Context) -> SlamService:
 def _maps(context: Context) -> Maps:
     config = context.config.slam
     if context.lockstep:
+        warm()
         return LockstepMap(config)
     folder = (config.map_folder or state_folder(context.uav)) if config.keep_map else None
-    return LiveMaps(config, folder, context.health)
+    maps = LiveMaps(config, folder, context.health)
+    warm_beside(maps.crew)
+    return maps
 
 
 class SlamService:
@@ -85,7 +87,8 @@ class SlamService:
         with health.timed("track"):
             depth_m = depth_raw.astype(np.float32) / np.float32(frame.intrinsics.depth_scale)
             accel = None if frame.accel_camera is None else np.array(frame.accel_camera)
-            result = slam.track(frame.stamp_ns, grey, depth_m, accel, self._attitude(frame.stamp_ns))
+            attitude_up = self._attitude(frame.stamp_ns)
+            result = slam.track(frame.stamp_ns, grey, depth_m, accel, attitude_up, 1e-9 * frame.depth_after_ns)
         self._last_stamp_ns, self._polished, self._idle_periods = frame.stamp_ns, False, 0
         if result.status in {"lost", "relocalising"}:
             health.count("lost_frames")

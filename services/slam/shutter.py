@@ -133,15 +133,18 @@ class Shutter:
             alive = set(self._atlas.keyframes.serial[self._atlas.slots].tolist())
             self._slopes = {s: slope for s, slope in self._slopes.items() if s in alive}
 
-    def settle(self, after: Velocity | None) -> None:
-        """Correct the last frame, if it became a keyframe, by the mean of the velocities before and ``after`` it."""
+    def settle(self, after: Velocity | None) -> tuple[int, Features, Velocity] | None:
+        """Correct the last frame, if it became a keyframe, by the mean of the velocities before and ``after`` it.
+
+        Returns the keyframe's slot, its features and that mean.
+        """
         moving, self._moving = self._moving, None
         if moving is None or after is None:
-            return
+            return None
         serial, features, before = moving
         k, roll = self._atlas.slot_of(serial), features.roll
         if k < 0 or roll is None or serial not in self._slopes:
-            return
+            return None
         mean = after
         if before is not None:
             mean = Velocity(0.5 * (before.v_m_s + after.v_m_s), 0.5 * (before.w_rad_s + after.w_rad_s))
@@ -149,6 +152,7 @@ class Shutter:
         self._slopes[serial] = now
         if self.readout_s != 0.0:
             self._shift(k, np.float32(self.readout_s) * (now - was))
+        return k, features, mean
 
     def _slopes_at(self, features: Features, roll: Roll, velocity: Velocity) -> F64:
         return slopes(roll.read, roll.row, features.depth, self._camera.array, velocity.v_m_s, velocity.w_rad_s)

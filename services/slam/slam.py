@@ -23,6 +23,7 @@ from services.slam.config import SlamConfig
 from services.slam.features import Extractor, Features
 from services.slam.ground import ground_up
 from services.slam.keyframing import KeyframeRule, Rest
+from services.slam.lag import Lag
 from services.slam.links import shared_counts
 from services.slam.loops import Loops
 from services.slam.mapping import Mapping
@@ -74,6 +75,7 @@ class Slam:
         self._last: Tracked | None = None
         self._motion = Motion()
         self.shutter = Shutter(self.atlas, camera)
+        self._lag = Lag(intrinsics, camera, config)
         self._verifier = Verifier(intrinsics, camera)
         self._found: tuple[int, Tracked] | None = None
         """Stamp and frame of a place found blind that waits for a second frame to say the same."""
@@ -101,14 +103,16 @@ class Slam:
         depth_m: NDArray[np.float32],
         accel_camera: F64 | None = None,
         attitude_up_camera: F64 | None = None,
+        depth_after_s: float = 0.0,
     ) -> TrackResult:
         """Locate one frame: ``grey`` (H, W), ``depth_m`` (H, W) metres, 0 = none.
 
         ``accel_camera`` (3,) m/s^2 in the camera's frame (at rest up times 9.81), ``attitude_up_camera`` (3,) up in the
-        camera's frame as the autopilot tells it.
+        camera's frame as the autopilot tells it, ``depth_after_s`` the depth image's stamp less ``stamp_ns``.
         """
         accel_camera, attitude_up_camera = gravity.direction(accel_camera), gravity.direction(attitude_up_camera)
         features = self._extractor.extract(grey, depth_m)
+        self._lag.begin(depth_m, depth_after_s)
         with self.crew.frame():
             if self.graph_version == 0:
                 return self._initialise(stamp_ns, features, depth_m, accel_camera, attitude_up_camera)
@@ -165,14 +169,14 @@ class Slam:
         last = self._last
         if last is None:
             return None
-        self.shutter.straighten(features, self._motion.velocity(stamp_ns))
+        self._place(features, self._motion.velocity(stamp_ns))
         predicted = inverse(self._motion.predict(stamp_ns)) @ pose(last.R, last.t)
         R = orthonormal(predicted[:3, :3])
         frame = self.tracking.follow(last, features, np.ascontiguousarray(R), predicted[:3, 3].copy())
         if frame is None:
             return None
         velocity = self._motion.velocity(stamp_ns, _step(last, frame))
-        self.shutter.straighten(features, velocity)
+        self._place(features, velocity)
         joined = self.tracking.join_map(frame)
         if joined is None or joined[0].inliers < self.config.min_inliers:
             return None
@@ -182,11 +186,16 @@ class Slam:
         believed = self._motion.plausible(stamp_ns, _step(last, joined[0]))
         return joined[0] if believed and self._verifier.believes(joined[0], depth_m, blind=False) else None
 
+    def _place(self, features: Features, velocity: Velocity) -> None:
+        """Put features where and as far away as they were at the frame's moment."""
+        self.shutter.straighten(features, velocity)
+        self._lag.look_up(features, velocity, self.shutter.readout_s)
+
     def _unroll(self, frame: Tracked, velocity: Velocity) -> None:
         """Place the features by the velocity that the frame itself tells, and the pose by them."""
         if self.shutter.readout_s == 0.0:
             return
-        self.shutter.straighten(frame.features, self.shutter.turn_rate(frame, velocity))
+        self._place(frame.features, self.shutter.turn_rate(frame, velocity))
         self.tracking.again(frame)
 
     def _level_map(self) -> GraphUpdate | None:
@@ -216,7 +225,7 @@ class Slam:
 
         When in doubt it is not believed before a second frame was found where the camera can be by then.
         """
-        self.shutter.straighten(features, STILL)
+        self._place(features, STILL)
         frame = self.loops.relocate(features)
         if frame is None or not self._verifier.believes(frame, depth_m, blind=True):
             self._found = None
@@ -239,7 +248,9 @@ class Slam:
     def _accept(self, stamp_ns: int, frame: Tracked, graph: GraphUpdate | None) -> TrackResult:
         """Remember a frame that has its pose, and make a keyframe of it when the map needs one."""
         self._motion.update(stamp_ns, None if self._last is None else _step(self._last, frame))
-        self.shutter.settle(self._motion.measured)
+        settled = self.shutter.settle(self._motion.measured)
+        if settled is not None:
+            self._lag.settle(self.atlas.keyframes, *settled, self.shutter.readout_s)
         new: list[NewKeyframe] = []
         if self._rule.wants(stamp_ns, frame, self.crew.waiting) or self.graph_version == 0:
             new, graph = self._make_keyframe(frame, graph)
@@ -256,6 +267,7 @@ class Slam:
         k = self.mapping.insert(frame.features, frame.R, frame.t, frame.point)
         serial = self.atlas.newest_serial
         self.shutter.keep(serial, frame.features, self._motion.measured)
+        self._lag.keep()
         self.crew.submit(lambda: self._settle(k))
         kf = self.atlas.keyframes
         settled = self.mapping.revision != self._revision

@@ -7,7 +7,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from schemas.camera import Intrinsics
-from services.slam.camera import CameraModel
+from services.slam.camera import CameraModel, distortion_of
+from services.slam.observe import distort
 from services.slam.tracking import Tracked
 
 F64 = NDArray[np.float64]
@@ -31,9 +32,7 @@ class Verifier:
     """Judges poses by the frame's depth image and by how much of the expected map was found."""
 
     def __init__(self, intrinsics: Intrinsics, camera: CameraModel) -> None:
-        i = intrinsics
-        self._camera = camera.array
-        self._distortion = np.array([i.k1, i.k2, i.p1, i.p2, i.k3])
+        self._camera, self._distortion = camera.array, distortion_of(intrinsics)
 
     def believes(self, frame: Tracked, depth_m: NDArray[np.float32], *, blind: bool) -> bool:
         """Return whether a pose is fit to be published; ``blind``: found without a last frame to begin from."""
@@ -67,16 +66,12 @@ def compare_depth(
     """
     counts[:] = 0
     height, width = depth_m.shape
-    k1, k2, p1, p2, k3 = distortion[0], distortion[1], distortion[2], distortion[3], distortion[4]
+    seen = np.empty(2)
     for i in range(len(place)):
         if np.isnan(place[i, 0]):
             continue
-        x, y = (place[i, 0] - camera[2]) / camera[0], (place[i, 1] - camera[3]) / camera[1]
-        r2 = x * x + y * y
-        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        xd = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-        yd = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-        u, v = int(camera[0] * xd + camera[2] + 0.5), int(camera[1] * yd + camera[3] + 0.5)
+        distort(place[i, 0], place[i, 1], camera, distortion, seen)
+        u, v = int(seen[0] + 0.5), int(seen[1] + 0.5)
         if u < 2 or v < 2 or u >= width - 2 or v >= height - 2:
             continue
         nearest, farthest = 0.0, 1e9

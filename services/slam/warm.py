@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import numpy as np
 
 from schemas.camera import Intrinsics
@@ -11,33 +13,74 @@ from services.slam.config import SlamConfig
 from services.slam.keeper import rejoin, whole_map
 from services.slam.shutter import turn_slopes
 from services.slam.slam import Slam
+from services.slam.worker import Crew, Inline, Job
 
-_done = False
+_CACHED_WITHIN_S = 10.0
+"""Kernels that took longer were compiled, not loaded."""
+_done: set[str] = set()
+
+
+class _Nobody(Inline):
+    """Does no job: tracking alone."""
+
+    def submit(self, job: Job) -> None:
+        """Leave it undone."""
 
 
 def warm() -> None:
     """Track a small moving scene once: that runs every kernel of the normal course. A second call does nothing."""
-    global _done
-    if _done:
+    warm_tracking()
+    warm_mapping()
+
+
+def warm_beside(crew: Crew) -> None:
+    """Load what tracking needs now, and have ``crew`` load the rest before its first job: the first pose waits for neither.
+
+    Where kernels have to be compiled, which takes minutes, everything is waited for.
+    """
+    begin = time.monotonic()
+    warm_tracking()
+    if time.monotonic() - begin > _CACHED_WITHIN_S:
+        warm_mapping()
+    else:
+        crew.submit(warm_mapping)
+
+
+def warm_tracking() -> None:
+    """Run the kernels that stand between a frame and its pose."""
+    if "tracking" in _done:
         return
     load_numba()
+    slam = _played(_Nobody(), 2)
+    turn_slopes(np.zeros((1, 2)), np.zeros(1), slam.camera.array)
+    _done.add("tracking")
+
+
+def warm_mapping() -> None:
+    """Run the kernels of mapping, of loops and of keeping the map."""
+    if "mapping" in _done:
+        return
+    slam = _played(Inline(), 4)
+    _warm_loop(slam)
+    _warm_keeping(slam)
+    _warm_large(slam)
+    slam.polish()
+    slam.mapping.retire(int(slam.atlas.slots[1]))
+    slam.final_trajectory()
+    _done.add("mapping")
+
+
+def _played(crew: Crew, frames: int) -> Slam:
+    """Return slam after the first frames of a scene that moves sideways, each of them a keyframe."""
     rng = np.random.Generator(np.random.PCG64(1))
     coarse = rng.integers(0, 255, (60, 80), dtype=np.uint8)
     grey = np.kron(coarse, np.ones((4, 4), np.uint8))
     depth_m = np.full(grey.shape, 2.0, np.float32)
     intrinsics = Intrinsics(width=320, height=240, fx=250.0, fy=250.0, cx=159.5, cy=119.5)
-    slam = Slam(intrinsics, SlamConfig(features=300, close_tracked_min=1000, close_untracked_max=0))
-    for index in range(4):
-        shift = 4 * index
-        slam.track(index, np.ascontiguousarray(np.roll(grey, shift, axis=1)), depth_m)
-    _warm_loop(slam)
-    _warm_keeping(slam)
-    _warm_large(slam)
-    turn_slopes(np.zeros((1, 2)), np.zeros(1), slam.camera.array)
-    slam.polish()
-    slam.mapping.retire(int(slam.atlas.slots[1]))
-    slam.final_trajectory()
-    _done = True
+    slam = Slam(intrinsics, SlamConfig(features=300, close_tracked_min=1000, close_untracked_max=0), crew=crew)
+    for index in range(frames):
+        slam.track(index, np.ascontiguousarray(np.roll(grey, 4 * index, axis=1)), depth_m, depth_after_s=0.001)
+    return slam
 
 
 def _warm_large(slam: Slam) -> None:

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas.camera import RgbdFrame
+from schemas.camera import RgbdFrame, depth_after
 from schemas.codec import Wire, decode, encode
 from schemas.envelope import DecodeError, Message
 from schemas.mapping import Submap
@@ -130,6 +130,26 @@ def test_unknown_missing_and_mistyped_fields_are_named() -> None:
         decode(Pose, msgpack.packb({k: v for k, v in body.items() if k != "inliers"}))
     with pytest.raises(DecodeError, match="seq"):
         decode(Pose, msgpack.packb({**body, "seq": "1"}))
+
+
+def test_rgbd_frame_from_before_depth_had_its_own_stamp_reads_as_before() -> None:
+    old = GOLDEN / "treedock.rgbd@1.bin"
+    assert RgbdFrame.from_bytes(old.read_bytes()).depth_after_ns == 0
+
+
+def test_rgbd_frame_with_the_depths_own_stamp_keeps_its_bytes() -> None:
+    golden = (GOLDEN / "treedock.rgbd@1.depth-after.bin").read_bytes()
+    late = replace(frame(), depth_after_ns=-19_500_000)
+    assert bytes(late.to_bytes()) == golden
+    assert RgbdFrame.from_bytes(golden).depth_after_ns == -19_500_000
+    before = (GOLDEN / "treedock.rgbd@1.bin").read_bytes()
+    assert [at for at, (a, b) in enumerate(zip(golden, before, strict=True)) if a != b] == [7], "the unused byte alone"
+
+
+def test_depth_after_is_rounded_and_ends_at_what_a_byte_holds() -> None:
+    assert depth_after(10**18, 10**18 + 6_800_000) == 7_000_000
+    assert depth_after(10**18, 10**18 - 19_100_000) == -19_000_000
+    assert depth_after(0, 10**9) == -depth_after(10**9, 0) == 63_500_000
 
 
 def test_rgbd_frame_with_wrong_sizes_is_refused() -> None:

@@ -45,10 +45,19 @@ def test_frames_come_with_the_devices_stamps_and_intrinsics(camera: Camera) -> N
     assert int(decode_depth_raw(good[2])[0, 0]) == 1503
 
 
-def test_a_device_clock_that_is_not_ours_gives_the_arrival(camera: Camera) -> None:
-    camera.domain = "hardware_clock"
+def test_depth_of_another_moment_says_so(camera: Camera) -> None:
+    camera.depth_late_ms = -6.0
     (frame,) = islice(source(camera), 1)
+    assert isinstance(frame, RgbdFrame)
+    assert frame.depth_after_ns == -6_000_000
+
+
+def test_a_device_clock_that_is_not_ours_gives_the_arrival(camera: Camera) -> None:
+    camera.domain, camera.depth_late_ms = "hardware_clock", 6.0
+    (frame,) = islice(source(camera), 1)
+    assert isinstance(frame, RgbdFrame)
     assert frame.stamp_ns == camera.now_ns
+    assert frame.depth_after_ns == 0
 
 
 def test_the_defaults_are_for_outdoors(camera: Camera) -> None:

@@ -15,7 +15,7 @@ from services.camera.sources import BadFrame, open_recording, open_source
 from services.camera.sources.ros_bag import BagSource
 from services.common.errors import InputError
 from tests.camera_data import CAMERA, colour_image, stamp_ns
-from tests.ros_bags import COLOUR, DEPTH, INFO, BagMaker, camera_messages, depth_mm
+from tests.ros_bags import COLOUR, DEPTH, DEPTH_LATE_NS, INFO, BagMaker, camera_messages, depth_mm
 
 CONFIG = CameraConfig(min_range_m=0.0, max_range_m=13.0, depth=DepthConfig(drop_mixed=False))
 
@@ -40,6 +40,7 @@ def test_a_bag_gives_its_frames(tmp_path: Path, ros: int, mcap: bool, form: str)
     assert source.expected == len(frames) == 4
     assert [f.stamp_ns for f in frames] == [stamp_ns(k) for k in range(4)]
     assert [f.seq for f in frames] == [0, 1, 2, 3]
+    assert {f.depth_after_ns for f in frames} == {DEPTH_LATE_NS}
     camera = frames[0].intrinsics
     assert (camera.fx, camera.cx, camera.k1, camera.k3) == (40.0, 23.5, 0.1, 0.05)
     for k, each in enumerate(frames):

@@ -47,6 +47,7 @@ def test_a_tum_folder_gives_its_frames(tmp_path: Path, associations: bool) -> No
     assert np.array_equal(decode_depth_raw(frames[1]), wanted)
     assert np.abs(decode_colour(frames[1]).astype(int) - colour_image(1)).mean() < 6
     assert frames[1].accel_camera is None
+    assert [f.depth_after_ns for f in frames] == [7_000_000] * 4
 
 
 def test_the_accelerometer_is_turned_into_the_camera_frame(tmp_path: Path) -> None:
@@ -263,6 +264,13 @@ def test_a_recorded_dead_accelerometer_tells_nothing(tmp_path: Path) -> None:
             writer.add(dataclasses.replace(frame(), accel_camera=force))
     items = list(McapSource(tmp_path / "a.mcap", CONFIG))
     assert [item.accel_camera for item in items if isinstance(item, RgbdFrame)] == [None, (0.0, -9.8, 0.0)]
+
+
+def test_a_recording_keeps_the_depths_own_stamp(tmp_path: Path) -> None:
+    with FrameWriter(tmp_path / "a.mcap") as writer:
+        writer.add(dataclasses.replace(frame(), depth_after_ns=-19_500_000))
+    items = frames_of(open_recording(tmp_path / "a.mcap", CONFIG))
+    assert [item.depth_after_ns for item in items] == [-19_500_000]
 
 
 def test_lossless_colour_is_a_setting(tmp_path: Path) -> None:

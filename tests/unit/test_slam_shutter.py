@@ -23,10 +23,14 @@ def project(X: F64) -> F64:
     return np.column_stack([CAMERA[0] * X[:, 0] / X[:, 2] + CAMERA[2], CAMERA[1] * X[:, 1] / X[:, 2] + CAMERA[3]])
 
 
+def moved_after(X: F64, s: F64) -> F64:
+    """Still points after times ``s`` (N,), camera moving with constant velocity in its own axes."""
+    return np.stack([exp_rotation(-W_RAD_S * t) @ (x - V_M_S * t) for x, t in zip(X, s, strict=True)])
+
+
 def seen_after(X: F64, s: F64) -> F64:
-    """Pixels of still points after times ``s`` (N,), camera moving with constant velocity in its own axes."""
-    turned = np.stack([exp_rotation(-W_RAD_S * t) @ (x - V_M_S * t) for x, t in zip(X, s, strict=True)])
-    return project(turned)
+    """Pixels of still points after times ``s`` (N,)."""
+    return project(moved_after(X, s))
 
 
 def points(count: int) -> F64:

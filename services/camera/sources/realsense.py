@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from schemas.camera import Intrinsics, RgbdFrame
+from schemas.camera import Intrinsics, RgbdFrame, depth_after
 from services.camera.codecs import encode_colour, encode_depth
 from services.camera.config import CameraConfig, RealsenseConfig
 from services.camera.sources.base import BadFrame
@@ -159,21 +159,22 @@ class RealsenseSource:
         colour_frame, depth_frame = frames.get_color_frame(), frames.get_depth_frame()
         if not colour_frame or not depth_frame:
             raise RuntimeError("colour or depth is missing from the pair")
+        colour_ns, depth_ns = self._taken_ns(colour_frame), self._taken_ns(depth_frame)
+        apart_ns = 0 if colour_ns is None or depth_ns is None else depth_after(colour_ns, depth_ns)
         return RgbdFrame(
-            stamp_ns=self._stamp_ns(colour_frame), seq=seq, intrinsics=self.intrinsics,
+            stamp_ns=self._now_ns() if colour_ns is None else colour_ns, seq=seq, intrinsics=self.intrinsics,
             colour=encode_colour(np.asanyarray(colour_frame.get_data()), "bgr8"),
             depth=encode_depth(np.asanyarray(depth_frame.get_data()), "z16"),
+            depth_after_ns=apart_ns,
         )  # fmt: skip
 
-    def _stamp_ns(self, frame: Device) -> int:
-        """Return when the frame was taken: by the device's clock where the library maps it to ours, else the arrival."""
-        now_ns = self._now_ns()
-        domain = frame.get_frame_timestamp_domain()
-        mapped = domain in (self._rs.timestamp_domain.global_time, self._rs.timestamp_domain.system_time)
+    def _taken_ns(self, frame: Device) -> int | None:
+        """Return when the image was taken by the device's clock where the library maps it to ours, else None: on arrival."""
+        mapped = (self._rs.timestamp_domain.global_time, self._rs.timestamp_domain.system_time)
+        if not self._settings.global_time or frame.get_frame_timestamp_domain() not in mapped:
+            return None
         stamp_ns = round(frame.get_timestamp() * 1e6)
-        return (
-            stamp_ns if self._settings.global_time and mapped and abs(now_ns - stamp_ns) < _CLOCK_WITHIN_NS else now_ns
-        )
+        return stamp_ns if abs(self._now_ns() - stamp_ns) < _CLOCK_WITHIN_NS else None
 
 
 def set_depth_sensor(rs: Device, sensor: Device, settings: RealsenseConfig) -> None:

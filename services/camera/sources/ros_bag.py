@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from schemas.camera import Intrinsics, RgbdFrame
+from schemas.camera import Intrinsics, RgbdFrame, depth_after
 from services.camera.codecs import FrameError, encode_colour, encode_depth
 from services.camera.config import CameraConfig
 from services.camera.sources.associate import associate, unpaired
@@ -80,7 +80,7 @@ class BagSource:
                 raise InputError(f"{path}: no frames: {unpaired(colour_ns, depth_ns, within_ns)}")
             self.remark = _left_out(len(colour_ns), len(self._pairs), within_ns)
             self.intrinsics, self._registration = self._cameras(reader, config)
-        self._colour_ns = colour_ns
+        self._colour_ns, self._depth_ns = colour_ns, depth_ns
         self.expected: int | None = len(self._pairs)
 
     def __iter__(self) -> Iterator[RgbdFrame | BadFrame]:
@@ -126,6 +126,7 @@ class BagSource:
         return RgbdFrame(
             stamp_ns=stamp_ns, seq=seq, intrinsics=camera, colour=encode_colour(bgr, "bgr8"),
             depth=encode_depth(raw, "z16"),
+            depth_after_ns=depth_after(stamp_ns, int(self._depth_ns[self._pairs[number]])),
         )  # fmt: skip
 
     def _cameras(self, reader: AnyReader, config: CameraConfig) -> tuple[Intrinsics, Any]:

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from schemas.camera import Intrinsics, RgbdFrame
+from schemas.camera import Intrinsics, RgbdFrame, depth_after
 from services.camera.codecs import FrameError, decode_colour_image, decode_depth_image, encode_colour, encode_depth
 from services.camera.config import CameraConfig
 from services.camera.sources.accelerometer import Accelerometer
@@ -80,6 +80,7 @@ class TumSource:
         return RgbdFrame(
             stamp_ns=pair.stamp_ns, seq=seq, intrinsics=camera, colour=encode_colour(colour, "bgr8"),
             depth=encode_depth(depth, "z16"), accel_camera=accel,
+            depth_after_ns=depth_after(pair.stamp_ns, pair.stamp_ns + pair.apart_ns),
         )  # fmt: skip
 
 
