@@ -31,7 +31,7 @@ _RAW_POINTS = 1_856_481
 _CLOSE = 5
 _FIRST, _STEP, _DRIFT_SHIFT = 8000, 100, 50
 _TABLE_CODE = (
-    "services.detector.reference", "services.detector.ransac_cylinder", "services.detector.detect", "services.evaluate.detection_tables",
+    "services.detector", "services.mapper", "services.simulator", "services.evaluate.detection_tables",
     "services.evaluate.detection_clouds",
 )  # fmt: skip
 
