@@ -10,16 +10,19 @@ import logging
 import subprocess
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from services.common.context import HealthBook
 from services.common.errors import InputError
 from services.common.process import die_with_parent, give_way
 from services.recorder.recover import cut_recordings, recover
 from services.recorder.space import free_bytes
 
+if TYPE_CHECKING:
+    from services.common.context import HealthBook
+
 LOG = logging.getLogger(__name__)
 
-_NICE = 19
+_NICE = 10
 _STOP_S = 0.2
 
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from services.common.context import HealthBook
+if TYPE_CHECKING:
+    from services.common.context import HealthBook
 
 _FREE, _RESERVE = "disk_free_mb", "disk_reserve_mb"
 _MB = 1_000_000

@@ -150,7 +150,7 @@ def test_every_identity_asks_and_answers_exactly_what_the_table_says(folder: Pat
                 session.declare_queryable(key, answer)
         time.sleep(SETTLE_S)
         for name, session in sessions.items():  # a node's questions at once, and then what came of them
-            coming = {key: session.get(key, timeout=1.0, target=zenoh.QueryTarget.ALL,
+            coming = {key: session.get(key, timeout=10.0, target=zenoh.QueryTarget.ALL,
                                        consolidation=zenoh.ConsolidationMode.NONE) for key in keys}  # fmt: skip
             for key, replies in coming.items():
                 answers[name, key] = {r.ok.payload.to_string() for r in replies if r.ok is not None} - {name}

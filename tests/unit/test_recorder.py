@@ -229,21 +229,27 @@ def cut_at(path: Path, share: float) -> None:
 
 
 def looked(service: Any, done: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 60.0
+    deadline = time.monotonic() + 240.0
     while not done() and time.monotonic() < deadline:
         service.tell()
         time.sleep(0.05)
     assert done()
 
 
-def test_a_recorder_records_at_once_and_what_was_cut_is_mended_beside_it(tmp_path: Path) -> None:
+def test_a_recorder_records_at_once_and_what_was_cut_is_mended_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It was mended before READY: 15 s of processor for each gigabyte that a kill left cut."""
+
+    def here(path: Path) -> None:
+        pytest.fail(f"{path} is mended in the recorder's own process")
+
+    monkeypatch.setattr("services.recorder.mender.recover", here)
     cut = recorded(tmp_path)
     cut_at(cut, 0.7)
     hub = Hub(TreedockConfig(recorder=RecorderConfig(folder=tmp_path, reserve_mb=0)))
     context = hub.context("recorder")
     service = build(cast("Context", context))
-    assert not is_whole(cut), "a process has begun, and this one goes on"
     hub.context("slam").publish(SLAM_POSE, example(Pose))
     hub.run()
     looked(service, lambda: context.health.counters["recordings_mended"] == 1)
