@@ -33,18 +33,18 @@ class Lag:
         self._depth_m: F32 = np.zeros((0, 0), np.float32)
         self._after_s = 0.0
         self._kept: tuple[F32, float] | None = None
-        """The newest keyframe's."""
+        """Of a keyframe whose velocity is not known yet."""
 
     def begin(self, depth_m: F32, after_s: float) -> None:
         """Take a frame's depth (H, W), metres, that was taken ``after_s`` after its colour."""
         self._depth_m, self._after_s = depth_m, after_s
 
     def keep(self) -> None:
-        """Remember the frame at hand: it became a keyframe."""
+        """Remember the frame at hand: it became a keyframe, and nothing is known of its velocity."""
         self._kept = self._depth_m, self._after_s
 
     def settle(self, kf: Keyframes, k: int, features: Features, velocity: Velocity, readout_s: float) -> None:
-        """Give keyframe ``k``, the one that was kept, its depth anew now that its velocity is known from both sides."""
+        """Give keyframe ``k``, the one that was kept, its depth anew now that its velocity is known."""
         kept, self._kept = self._kept, None
         if kept is None or not self._look_up(features, kept, velocity, readout_s):
             return

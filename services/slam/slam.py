@@ -267,7 +267,8 @@ class Slam:
         k = self.mapping.insert(frame.features, frame.R, frame.t, frame.point)
         serial = self.atlas.newest_serial
         self.shutter.keep(serial, frame.features, self._motion.measured)
-        self._lag.keep()
+        if self._motion.measured is None:
+            self._lag.keep()
         self.crew.submit(lambda: self._settle(k))
         kf = self.atlas.keyframes
         settled = self.mapping.revision != self._revision
