@@ -21,15 +21,16 @@ _EXIT_NOT_REACHED = 3
 
 Count = Annotated[int, typer.Option("--aircraft", help="How many.", min=1, max=9)]
 Seed = Annotated[int, typer.Option("--seed", help="Of forest, weather, link and clocks.", min=0)]
+WithPx4 = Annotated[bool, typer.Option("--px4", help="On simulated autopilots, with the live guard: ten times slower.")]
 
 
 @fleet_app.command()
-def fly(*, aircraft: Count = 2, seed: Seed = 0, as_json: AsJson = False) -> int:
+def fly(*, aircraft: Count = 2, seed: Seed = 0, px4: WithPx4 = False, as_json: AsJson = False) -> int:
     """Fly a fleet in one forest, without rendering, over a link that drops; exit 0 when each tree was visited once."""
     from services.evaluate.bench_fleet import fly as flown
     from services.evaluate.bench_fleet import line_of
 
-    row = flown(seed, aircraft)
+    row = flown(seed, aircraft, px4=px4)
     typer.echo(line_of(row), err=as_json)
     if as_json:
         typer.echo(json.dumps(row))

@@ -16,6 +16,7 @@ from schemas.fleet import ClaimGoal, ClaimReply
 from services.evaluate.eyes import Round
 from services.evaluate.fleet_link import Clock, FleetLink, LinkFaults
 from services.evaluate.flight import TICK_NS, Flight, FlightCase, weather
+from services.evaluate.glider import STEP_NS, Glider
 from services.evaluate.synthetic import TrueTrunk
 from services.fleet.book import Memory
 from services.fleet.config import ClaimConfig, FleetConfig
@@ -29,8 +30,8 @@ from services.navigator.config import NavigatorConfig
 _SITE_DEG = (48.1, 11.5, 520.0)
 _SIGMA_M, _SIGMA_HEADING_DEG = 0.05, 0.3
 """Of the start points as they are configured."""
-_SPACING_M = 7.0
-_TREES_EACH = 2
+_SPACING_M = 6.5
+_TREES_EACH = 3
 _BODY_M = 0.35
 _IN_AIR_M = 0.4
 _DRIFT = 0.01
@@ -55,6 +56,8 @@ class FleetCase:
     outages: tuple[Outage, ...]
     rates: dict[str, float]
     """How fast each clock runs; the arbiter's under ``arbiter``."""
+    px4: bool = False
+    """Each on a simulated PX4, with eyes for the live guard; else gliders, ten times as fast."""
 
 
 class AirDesk:
@@ -103,7 +106,10 @@ class FleetFlight:
 
         clocks = {name: Clock(rate, rng.randrange(10**12)) for name, rate in self.case.rates.items()}
         self.link = FleetLink(FleetConfig(enabled=True), LinkFaults(), rng, clocks["arbiter"], place, Memory())
-        self.flights = {uav: Flight(case) for uav, case in self.case.flights.items()}
+        self.flights: dict[str, Flight | Glider] = {
+            uav: Flight(case) if self.case.px4 else Glider(case) for uav, case in self.case.flights.items()
+        }
+        self._tick_ns = TICK_NS if self.case.px4 else STEP_NS
         self.desks = {
             uav: AirDesk(uav, self.link, clocks[uav], f.case.navigator.claims) for uav, f in self.flights.items()
         }
@@ -132,10 +138,10 @@ class FleetFlight:
                 return
 
     def tick(self) -> None:
-        """Let 10 ms pass for everybody."""
-        self.now_ns += TICK_NS
+        """Let one tick pass for everybody."""
+        self.now_ns += self._tick_ns
         self._outages()
-        flying = {uav: f.px4.true_pose()[:3, 3] for uav, f in self.flights.items()}
+        flying = {uav: f.place_m for uav, f in self.flights.items()}
         flying = {uav: p for uav, p in flying.items() if p[2] > _IN_AIR_M}
         for uav, flight in self.flights.items():
             self.desks[uav].now_ns = self.now_ns
@@ -190,12 +196,12 @@ class FleetFlight:
         return found
 
 
-def fleet_case(seed: int, count: int) -> FleetCase:
-    """Return a forest with ``count`` aircraft 7 m apart, outages of the link and of the arbiter, clocks up to 1 % wrong."""
+def fleet_case(seed: int, count: int, *, px4: bool = False) -> FleetCase:
+    """Return a forest with ``count`` aircraft 6.5 m apart, outages of the link and of the arbiter, clocks up to 1 % wrong."""
     rng = np.random.default_rng([seed, 91])
     starts = [(_SPACING_M * (k % 2), _SPACING_M * (k // 2)) for k in range(count)]
     trunks = _forest(starts, _TREES_EACH * count, rng)
-    navigator = NavigatorConfig(trees_wanted=50, claims=ClaimConfig(enabled=True))
+    navigator = NavigatorConfig(trees_wanted=50, claims=ClaimConfig(enabled=True), live_guard=px4)
     wind = weather(rng)
     plane, flights, points = TangentPlane(*_SITE_DEG), {}, []
     for k, start in enumerate(starts):
@@ -205,7 +211,7 @@ def fleet_case(seed: int, count: int) -> FleetCase:
         )
         points.append(_start_point(f"uav{k + 1}", start, yaw, plane, rng))
     rates = {name: 1.0 + float(rng.uniform(-_DRIFT, _DRIFT)) for name in ("arbiter", *flights)}
-    return FleetCase(seed, flights, tuple(points), _drawn_outages(tuple(flights), rng), rates)
+    return FleetCase(seed, flights, tuple(points), _drawn_outages(tuple(flights), rng), rates, px4)
 
 
 def _start_point(
@@ -239,7 +245,7 @@ def _drawn_outages(uavs: tuple[str, ...], rng: np.random.Generator) -> tuple[Out
     """Return cuts shorter than half a lease, two for each aircraft, and one or two restarts of the arbiter."""
     found = []
     for who in (*uavs, *uavs, "arbiter", *(["arbiter"] if rng.random() < 0.5 else [])):
-        begin = float(rng.uniform(20.0, 300.0))
+        begin = float(rng.uniform(15.0, 180.0))
         found.append(Outage(who, begin, begin + float(rng.uniform(3.0, 12.0))))
     return tuple(found)
 

@@ -142,6 +142,11 @@ class Flight:
         return self.mission.state
 
     @property
+    def place_m(self) -> Matrix:
+        """Where it truly is (3,)."""
+        return self.px4.true_pose()[:3, 3]
+
+    @property
     def elapsed_s(self) -> float:
         """Simulated time flown."""
         return (self.now_ns - _START_NS) / 1e9
