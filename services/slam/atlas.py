@@ -87,8 +87,13 @@ class Atlas:
             free = np.flatnonzero(grown.n == 0)
         k, n, kf = int(free[0]), len(features), self.keyframes
         kf.R[k], kf.t[k], kf.n[k], kf.serial[k] = R, t, n, self._serial
-        kf.uv[k, :n], kf.depth[k, :n], kf.disparity[k, :n] = features.uv, features.depth, features.disparity
-        kf.far[k, :n], kf.info[k, :n] = features.far, features.info
+        still = features.moving_s == 0.0  # what moves makes no points
+        kf.uv[k, :n], kf.depth[k, :n], kf.disparity[k, :n] = (
+            features.uv,
+            still * features.depth,
+            still * features.disparity,
+        )
+        kf.far[k, :n], kf.info[k, :n] = features.far & still, still * features.info
         kf.octave[k, :n], kf.angle[k, :n], kf.desc[k, :n] = features.octave, features.angle, features.desc
         kf.cell_start[k], kf.cell_items[k, :n] = features.cell_start, features.cell_items
         kf.point[k] = -1

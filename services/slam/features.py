@@ -5,7 +5,7 @@ ORB: Rublee, Rabaud, Konolige and Bradski, "ORB: an efficient alternative to SIF
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -63,6 +63,12 @@ class Features:
     cell_start: I32
     cell_items: I32
     roll: Roll | None = None
+    moving_s: F64 = field(default_factory=lambda: np.zeros(0))
+    """(N,) for how long it is not to be trusted, because it was seen to move by itself; 0 for most."""
+
+    def __post_init__(self) -> None:
+        if len(self.moving_s) != len(self.uv):
+            self.moving_s = np.zeros(len(self.uv))
 
     def __len__(self) -> int:
         return len(self.uv)

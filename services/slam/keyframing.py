@@ -38,7 +38,7 @@ class KeyframeRule:
         if self._flown:
             return self._due(stamp_ns) or frame.inliers < _HARDLY * self._config.min_inliers
         config, f = self._config, frame.features
-        close = (f.depth >= config.min_depth_m) & (f.depth <= config.max_depth_m)
+        close = (f.depth >= config.min_depth_m) & (f.depth <= config.max_depth_m) & (f.moving_s == 0.0)
         tracked = int(np.count_nonzero(close & (frame.point >= 0)))
         untracked = int(np.count_nonzero(close & (frame.point < 0)))
         if tracked < config.close_tracked_min and untracked > config.close_untracked_max:

@@ -51,7 +51,7 @@ class Motion:
 
     def predict(self, stamp_ns: int) -> F64:
         """Return T_last_camera (4, 4) expected at a stamp."""
-        dt_s = self._since(stamp_ns)
+        dt_s = self.since_s(stamp_ns)
         if dt_s > _KEEPS_S:
             return np.eye(4)
         return pose(exp_rotation(self._w_rad_s * dt_s), self._v_m_s * dt_s)
@@ -61,7 +61,7 @@ class Motion:
 
         Without ``T_last_camera`` that of the last step goes on; with it, that of this step goes on changing as it did.
         """
-        dt_s = self._since(stamp_ns)
+        dt_s = self.since_s(stamp_ns)
         if dt_s > _KEEPS_S:
             return STILL
         if T_last_camera is None or dt_s <= 0.0:
@@ -79,7 +79,7 @@ class Motion:
 
     def plausible(self, stamp_ns: int, T_last_camera: F64) -> bool:
         """Return whether the camera can have moved so since the last frame."""
-        dt_s = self._since(stamp_ns)
+        dt_s = self.since_s(stamp_ns)
         if not can_have_moved(dt_s, T_last_camera):
             return False
         if not self._sure or dt_s > _KEEPS_S:
@@ -93,7 +93,7 @@ class Motion:
 
     def update(self, stamp_ns: int, T_last_camera: F64 | None) -> None:
         """Take the step since the last frame, None when there is none to speak of."""
-        dt_s = self._since(stamp_ns)
+        dt_s = self.since_s(stamp_ns)
         if T_last_camera is None or not 0.0 < dt_s <= _KEEPS_S:
             self.forget()
         else:
@@ -102,7 +102,8 @@ class Motion:
             self._sure, self._step_s = True, dt_s
         self._stamp_ns = stamp_ns
 
-    def _since(self, stamp_ns: int) -> float:
+    def since_s(self, stamp_ns: int) -> float:
+        """Return the time since the last frame."""
         return 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) * 1e-9
 
 

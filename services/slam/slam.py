@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from schemas.camera import Intrinsics
 from schemas.slam import GraphReason, SlamStatus
 from services.common.geometry import inverse, orthonormal, pose
-from services.slam import gravity, vocabulary
+from services.slam import gravity, movers, vocabulary
 from services.slam.atlas import Atlas
 from services.slam.camera import camera_model
 from services.slam.config import SlamConfig
@@ -183,6 +183,7 @@ class Slam:
         if self.shutter.learn(joined[0]):
             self.mapping.owed = True
         self._unroll(joined[0], velocity)
+        movers.mark(self.tracking, last, joined[0], self._motion.since_s(stamp_ns))
         believed = self._motion.plausible(stamp_ns, _step(last, joined[0]))
         return joined[0] if believed and self._verifier.believes(joined[0], depth_m, blind=False) else None
 

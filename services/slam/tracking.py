@@ -29,6 +29,8 @@ MATCH_BLIND = 60
 """Where it is not."""
 _WINDOW_LAST_PX = 15.0
 _WINDOW_MAP_PX = 5.0
+_PROVEN, _PROVEN_LEAST = 5, 40
+"""Frames in which a point has been found, from which on it is proven; and so many such points place a frame."""
 _ENOUGH = 20
 """Matches with the last frame below which the window is widened."""
 
@@ -65,6 +67,7 @@ class Tracking:
     def follow(self, last: Tracked, features: Features, R: F64, t: F64) -> Tracked | None:
         """Return the frame located from the last one, started at the predicted ``R``, ``t``; None when that fails."""
         world, known, usable = self._points_of_last(last)
+        usable &= last.features.moving_s == 0.0
         for widen in (1.0, 2.0, 4.0):
             match = self._match_last(last, features, R, t, world, usable, widen * _WINDOW_LAST_PX)
             if np.count_nonzero(match >= 0) < _ENOUGH * widen:
@@ -85,6 +88,33 @@ class Tracking:
         has = known >= 0
         world[has] = self.atlas.points.pos[known[has]]
         return world, known, has | (z > 0.0)
+
+    def by_proven(self, frame: Tracked) -> Tracked | None:
+        """Return the frame as only points place it that were found in several frames before; None where they are too few."""
+        p = self.atlas.points
+        index = np.flatnonzero(frame.point >= 0)
+        index = index[p.found[frame.point[index]] >= _PROVEN]
+        if len(index) < _PROVEN_LEAST:
+            return None
+        ids, R, t = frame.point[index], frame.R.copy(), frame.t.copy()
+        doubt = far_doubt(p, self.atlas.keyframes, ids, R, t, self.camera.focal, self.far.sigma_inverse_m)
+        count, _, H, chi2 = self.refine(frame.features, R, t, p.pos[ids], index, doubt)
+        return Tracked(frame.features, R, t, frame.point, count, H, chi2) if count >= _PROVEN_LEAST else None
+
+    def off_their_places(self, last: Tracked, frame: Tracked) -> tuple[I32, F64]:
+        """Return which feature of the frame each of the last one's became (-1: not seen), and how far off it is.
+
+        The second (N, 2) is of the frame's features: pixels from where the camera's motion takes what was seen in the last
+        frame, NaN where nothing known was.
+        """
+        f, cam = frame.features, self.camera
+        world, _, usable = self._points_of_last(last)
+        match = self._match_last(last, f, frame.R, frame.t, world, usable, 2.0 * _WINDOW_LAST_PX)
+        queries = np.flatnonzero(match >= 0)
+        place = predict(world[queries], usable[queries], frame.R, frame.t, cam.array, cam.width, cam.height)
+        off = np.full((len(f), 2), np.nan)
+        off[match[queries]] = f.uv[match[queries]] - place[:, :2]
+        return match, off
 
     def _doubt_of_last(self, known: I32, features: I32, last: Tracked | None, R: F64, t: F64) -> F64:
         """Return the doubt (M,) of the last frame's ``features``: of map points ``known``, or (-1) temporary ones."""
