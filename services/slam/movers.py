@@ -10,10 +10,12 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from services.slam.match import CELL_PX
 from services.slam.observe import jacobian, pose_jacobian
 from services.slam.tracking import Tracked, Tracking
 
 F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
 
 _AROUND_PX = 60.0
 _ALIKE_PX = 2.0
@@ -44,7 +46,8 @@ def mark(tracking: Tracking, last: Tracked, frame: Tracked, dt_s: float) -> None
     assert judge.information is not None
     covariance: F64 = np.asarray(np.linalg.inv(judge.information + 1e-6 * np.eye(6)), np.float64)
     doubt = doubts(f.uv, f.depth, covariance, tracking.camera.array)
-    f.moving_s = suspects(f.uv, f.disparity, off, doubt, before, usual_off(off, before))
+    cols, usual_px = tracking.camera.cols, usual_off(off, before)
+    f.moving_s = suspects(f.uv, f.disparity, f.cell_start, f.cell_items, cols, off, usual_px, doubt, before)
     taken = (f.moving_s > 0.0) & (frame.point >= 0)
     if taken.any():
         frame.point[taken] = -1
@@ -78,56 +81,65 @@ def doubts(uv: F64, depth: F64, covariance: F64, camera: F64) -> F64:
 
 
 @njit(cache=True, nogil=True)
-def beside(uv: F64, disparity: F64, off: F64, i: int, j: int) -> bool:
-    """Return whether feature ``j``, seen in the last frame too, is a neighbour of ``i`` in the image and in depth."""
-    return (
-        abs(uv[i, 0] - uv[j, 0]) <= _AROUND_PX
-        and abs(uv[i, 1] - uv[j, 1]) <= _AROUND_PX
-        and abs(disparity[i] - disparity[j]) <= _ALIKE_PX
-        and not np.isnan(off[j, 0])
-    )
+def around(uv: F64, disparity: F64, off: F64, cell_start: I32, cell_items: I32, cols: int, i: int, out: I32) -> int:
+    """Write into ``out`` the neighbours of feature ``i``, in the image and in depth, that the last frame saw too; return how many."""
+    rows = (len(cell_start) - 1) // cols
+    u, v = uv[i, 0], uv[i, 1]
+    c0, c1 = max(int((u - _AROUND_PX) / CELL_PX), 0), min(max(int((u + _AROUND_PX) / CELL_PX), 0), cols - 1)
+    r0, r1 = max(int((v - _AROUND_PX) / CELL_PX), 0), min(max(int((v + _AROUND_PX) / CELL_PX), 0), rows - 1)
+    count = 0
+    for row in range(r0, r1 + 1):
+        for k in range(cell_start[row * cols + min(c0, c1)], cell_start[row * cols + c1 + 1]):
+            j = cell_items[k]
+            if abs(disparity[i] - disparity[j]) > _ALIKE_PX or np.isnan(off[j, 0]):
+                continue
+            if abs(uv[j, 0] - u) <= _AROUND_PX and abs(uv[j, 1] - v) <= _AROUND_PX:
+                out[count] = j
+                count += 1
+    return count
 
 
 @njit(cache=True, nogil=True)
-def together(uv: F64, disparity: F64, off: F64, least2: float, i: int) -> bool:
-    """Return whether the neighbours of feature ``i`` are off their places together, by more than ``least2``, pixels squared."""
-    count, x, y, squares = 0, 0.0, 0.0, 0.0
-    for j in range(len(uv)):
-        if beside(uv, disparity, off, i, j):
-            count += 1
-            x, y = x + off[j, 0], y + off[j, 1]
-            squares += off[j, 0] ** 2 + off[j, 1] ** 2
+def together(off: F64, which: I32, least2: float) -> bool:
+    """Return whether features ``which`` are off their places together, by more than ``least2``, pixels squared."""
+    count, x, y, squares = len(which), 0.0, 0.0, 0.0
     if count < _LEAST:
         return False
+    for j in which:
+        x, y = x + off[j, 0], y + off[j, 1]
+        squares += off[j, 0] ** 2 + off[j, 1] ** 2
     mean2 = (x * x + y * y) / count**2
     return mean2 > least2 and mean2 * count > _SURE**2 * (squares / count - mean2)
 
 
 @njit(cache=True, nogil=True)
-def suspects(uv: F64, disparity: F64, off: F64, doubt: F64, before: F64, usual_px: float) -> F64:
+def suspects(
+    uv: F64, disparity: F64, cell_start: I32, cell_items: I32, cols: int, off: F64, usual_px: float, doubt: F64, before: F64
+) -> F64:  # fmt: skip
     """Return for how long (N,), seconds, features are not to be trusted, 0 for most, and for all without depth: they do not pull.
 
     ``off`` (N, 2) pixels from where they should have come to lie since the last frame (NaN: not seen there), ``usual_px`` how
     far others are off, ``doubt`` (N,) the variance of it for the pose's, ``before`` (N,) how long they were not to be trusted
-    yet: who is a suspect has to stand still to be trusted again, for him the doubt does not count. Neighbours decide by majority.
+    yet: who is a suspect has to stand still to be trusted again, for him the doubt does not count. Neighbours decide by
+    majority; the search grid finds them.
     """
     n = len(uv)
-    own, out = before.copy(), np.zeros(n)
-    near = np.flatnonzero(disparity > 0.0)
+    own, out, found = before.copy(), np.zeros(n), np.empty(n, np.int32)
     least2 = max(_OFF_PX, usual_px) ** 2
-    for a in range(len(near)):
-        i = int(near[a])
-        if together(uv, disparity, off, least2 + (_DOUBTS**2 * doubt[i] if before[i] == 0.0 else 0.0), i):
-            own[i] = _REMEMBERED_S
-    for a in range(len(near)):
-        i = int(near[a])
-        count, suspected, total = 0, 0, 0.0
-        for b in range(len(near)):
-            j = int(near[b])
-            if beside(uv, disparity, off, i, j):
-                count += 1
+    for i in range(n):
+        if disparity[i] > 0.0:
+            count = around(uv, disparity, off, cell_start, cell_items, cols, i, found)
+            if together(off, found[:count], least2 + (_DOUBTS**2 * doubt[i] if before[i] == 0.0 else 0.0)):
+                own[i] = _REMEMBERED_S
+    if not own.any():
+        return out
+    for i in range(n):
+        if disparity[i] > 0.0:
+            count = around(uv, disparity, off, cell_start, cell_items, cols, i, found)
+            suspected, total = 0, 0.0
+            for j in found[:count]:
                 suspected += own[j] > 0.0
                 total += own[j]
-        if 2 * suspected > count:
-            out[i] = total / suspected
+            if 2 * suspected > count:
+                out[i] = total / suspected
     return out

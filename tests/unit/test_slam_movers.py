@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from services.common.geometry import inverse, level_camera
 from services.slam.config import SlamConfig
+from services.slam.features import grid_of
 from services.slam.movers import doubts, suspects, usual_off
 from services.slam.slam import Slam
 from tests.unit.slam_room import INTRINSICS, look
@@ -34,7 +35,11 @@ def still(seed: int = 2) -> F64:
 
 
 def judged(uv: F64, disparity: F64, off: F64, before: F64) -> F64:
-    return suspects(uv, disparity, off, np.full(200, 0.05), before, usual_off(off, before))
+    return suspected(uv, disparity, off, np.full(200, 0.05), before)
+
+
+def suspected(uv: F64, disparity: F64, off: F64, doubt: F64, before: F64) -> F64:
+    return suspects(uv, disparity, *grid_of(uv, 32, 24), 32, off, usual_off(off, before), doubt, before)
 
 
 def test_neighbours_that_are_off_together_are_suspects_and_nothing_else_is() -> None:
@@ -86,9 +91,9 @@ def test_a_pose_in_doubt_suspects_nobody_new_but_frees_nobody_either() -> None:
     off, before = still(), np.zeros(200)
     off[SOMEBODY] += [4.0, -1.0]
     doubt = np.full(200, 4.0)
-    assert not suspects(uv, disparity, off, doubt, before, 1.5).any()
+    assert not suspected(uv, disparity, off, doubt, before).any()
     before[SOMEBODY] = 0.1
-    assert (suspects(uv, disparity, off, doubt, before, 1.5)[SOMEBODY] > 1.0).all()
+    assert (suspected(uv, disparity, off, doubt, before)[SOMEBODY] > 1.0).all()
 
 
 def test_the_doubt_of_a_place_is_what_the_poses_error_moves_it_by() -> None:
