@@ -120,8 +120,8 @@ def suspects(
 
     ``off`` (N, 2) pixels from where they should have come to lie since the last frame (NaN: not seen there), ``usual_px`` how
     far others are off, ``doubt`` (N,) the variance of it for the pose's, ``before`` (N,) how long they were not to be trusted
-    yet: who is a suspect has to stand still to be trusted again, for him the doubt does not count. Neighbours decide by
-    majority; the search grid finds them.
+    yet: who is a suspect has to stand still to be trusted again, for him the doubt counts little. What is new is a suspect
+    where most of its neighbours are, and nobody is one alone; the search grid finds the neighbours.
     """
     n = len(uv)
     own, out, found = before.copy(), np.zeros(n), np.empty(n, np.int32)
@@ -129,7 +129,7 @@ def suspects(
     for i in range(n):
         if disparity[i] > 0.0:
             count = around(uv, disparity, off, cell_start, cell_items, cols, i, found)
-            if together(off, found[:count], least2 + (_DOUBTS**2 * doubt[i] if before[i] == 0.0 else 0.0)):
+            if together(off, found[:count], least2 + doubt[i] * (_DOUBTS**2 if before[i] == 0.0 else 1.0)):
                 own[i] = _REMEMBERED_S
     if not own.any():
         return out
@@ -140,6 +140,7 @@ def suspects(
             for j in found[:count]:
                 suspected += own[j] > 0.0
                 total += own[j]
+            seen = not np.isnan(off[i, 0])
             if 2 * suspected > count:
-                out[i] = total / suspected
+                out[i] = total / suspected if not seen or 5 * suspected > 4 * count else own[i]
     return out
