@@ -39,7 +39,8 @@ class Claims:
     _wanted: ClaimGoal | None = None
     _again: bool = False
     _now_ns: int = 0
-    _heard: int = 0
+    _heard: int | None = None
+    """Number of the last refusal that was acted upon; what was refused to the mission before is none of this one's."""
     _final: dict[int, str] = field(default_factory=dict)
     _held_by_others: dict[int, tuple[str, int]] = field(default_factory=dict)
     """Why, and until when (ns) the tree is not asked for again."""
@@ -57,6 +58,8 @@ class Claims:
         """Begin a step."""
         self.view, self._now_ns = view or ClaimView(), now_ns
         self._wanted, self._again, self.done = None, False, False
+        if self._heard is None:
+            self._heard = 0 if self.view.refusal is None else self.view.refusal.number
 
     def forget(self) -> None:
         """Forget the trees by number: the map is another."""
@@ -73,7 +76,7 @@ class Claims:
             self._waiting = (goal.kind, self._now_ns)
         if goal.tree_id is None and self._now_ns < self._not_before_ns:
             return "refused"
-        if refusal is not None and refusal.number > self._heard and same_goal(refusal.goal, goal):
+        if refusal is not None and refusal.number > (self._heard or 0) and same_goal(refusal.goal, goal):
             self._heard = refusal.number
             if goal.tree_id is None:
                 self._not_before_ns = self._now_ns + round(1e9 * self.config.again_s)
@@ -140,10 +143,12 @@ class Claims:
         over = state in _ON_THE_GROUND and not armed  # under the pilot it still stands where it stands
         here = b.here
         if here is None:
-            return Wish(self._wanted, self._again, self._heard, self.done, over)
+            return Wish(self._wanted, self._again, self._heard or 0, self.done, over)
         held = self.view.held
         to_m = None if held is None else _present(b, held)
-        return Wish(self._wanted, self._again, self._heard, self.done, over, _flat(here.position_m), to_m, here.map_id)
+        return Wish(
+            self._wanted, self._again, self._heard or 0, self.done, over, _flat(here.position_m), to_m, here.map_id
+        )
 
 
 def start_goal(b: Board) -> ClaimGoal | None:

@@ -63,6 +63,19 @@ def test_a_tree_that_another_visited_is_not_visited_again_but_by_order() -> None
     assert again.run("face", 60.0) == "face"
 
 
+def test_what_was_refused_to_one_mission_is_asked_again_in_the_next() -> None:
+    world = ClaimsWorld(trees=[tree(1, 3.0, 1.0)])
+    world.start()
+    world.run("scan")
+    world.other_claims(3.05, 1.0, done=True)
+    assert world.run("landed", 100.0) == "landed"
+    assert "uav2 has docked" in world.holder.note
+    world.book.done.clear()  # the operator began a new round
+    world.run(seconds=2.0)
+    world.start()
+    assert world.run("approach", 100.0) == "approach"
+
+
 def test_it_waits_for_a_tree_that_another_holds_and_says_so() -> None:
     world = ClaimsWorld(trees=[tree(1, 3.0, 1.0)])
     world.start()
