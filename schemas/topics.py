@@ -75,6 +75,8 @@ class Topic:
     recorded: bool = True
     radio_hz: float = 0.0
     """Behind a router's radio interface the key is thinned to this rate; 0: every sample passes."""
+    beside: bool = False
+    """Of another camera, or the same told another way: who shows or reports the one aircraft passes it over."""
     description: str = ""
 
     @property
@@ -101,15 +103,15 @@ ANY = "*"
 CAMERA_RGBD = Topic("camera/rgbd", RgbdFrame, "camera", ("slam", "refiner", "navigator", "preview"), 15, 1.0, _H, _LATEST, "data",
                     description="colour and registered depth, raw")  # fmt: skip
 SECOND_RGBD = Topic("second/rgbd", RgbdFrame, "second_camera", ("second_slam",), 15, 1.0, _H, _LATEST, "data", recorded=False,
-                    description="the second camera's frames, raw; only where there is one")  # fmt: skip
+                    beside=True, description="the second camera's frames, raw; only where there is one")  # fmt: skip
 SECOND_POSE = Topic("second/pose", Pose, "second_slam", ("fusion", "simulator"), 15, 0.5, _A, _STREAM, "interactive_high", express=True,
-                    description="the second camera in a map of its own, for fusion alone")  # fmt: skip
+                    beside=True, description="the second camera in a map of its own, for fusion alone")  # fmt: skip
 CAMERA_COMPRESSED = Topic("camera/rgbd_compressed", RgbdFrame, "camera", ("slam", "refiner", "navigator", "recorder"), 0, None, _A, _LATEST, "data_low",
                           description="the same as JPEG and PNG, sent only while somebody listens")  # fmt: skip
 SLAM_POSE = Topic("slam/pose", Pose, "slam", ("refiner", "detector", "navigator", "autopilot", "simulator", "station", "preview", "fusion"), 15, 0.5, _R, _STREAM,
                   "interactive_high", radio_hz=5, express=True, description="camera in map for each frame, with covariance")  # fmt: skip
 FUSION_POSE = Topic("fusion/pose", Pose, "fusion", ("navigator", "autopilot"), 15, 0.5, _A, _STREAM, "interactive_high", express=True,
-                    description="slam's pose, carried on where slam is lost: taken instead of slam/pose while fusion is on")  # fmt: skip
+                    beside=True, description="slam's pose, carried on where slam is lost: taken instead of slam/pose while fusion is on")  # fmt: skip
 FUSION_STATE = Topic("fusion/state", FusionState, "fusion", ("evaluate",), 2, 3.0, _R, _STREAM, "data_high", radio_hz=1,
                      description="what carries the pose, whether the GPS is believed, the place on the earth")  # fmt: skip
 SLAM_KEYFRAME = Topic("slam/keyframe", Keyframe, "slam", ("mapper",), 0, None, _A, _ADVANCED, "data", cache=64,

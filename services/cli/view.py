@@ -48,10 +48,10 @@ def _play(file: Path, scene: Scene) -> int:
 
     faults = 0
     for entry in messages(file):
-        if isinstance(entry, Recorded):
-            scene.show(entry.message)
-        else:
+        if not isinstance(entry, Recorded):
             faults += 1
+        elif not entry.topic.beside:
+            scene.show(entry.message)
     return faults
 
 

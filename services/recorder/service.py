@@ -90,7 +90,7 @@ class RecorderService:
         with self._context.health.timed("take"):
             if self.drain is not None:
                 self._queue(self.drain, topic, message)
-            ended = self._chronicle.hear(message)
+            ended = not topic.beside and self._chronicle.hear(message)
         if ended:
             self._report()
 
@@ -100,7 +100,7 @@ class RecorderService:
         key = topic.key(self._context.uav, message.service if isinstance(message, Health) else None)
         schema, seq = getattr(topic.message, "SCHEMA", topic.name), getattr(message, "seq", 0)
         drain.put(Entry(key, schema, topic.encoding, bytes(encode(message)), stamp_ns, seq, heavy))
-        if self._translator is not None:
+        if self._translator is not None and not topic.beside:
             for name, shown in self._translator.translate(message):
                 drain.put(Entry(name, "", "", shown, stamp_ns, 0, heavy))
 

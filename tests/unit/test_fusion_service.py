@@ -215,6 +215,19 @@ def test_nothing_heavy_is_loaded_while_it_is_off() -> None:
     assert done.stdout.strip() == "False"
 
 
+def test_recorder_and_report_pass_over_the_poses_beside_slams() -> None:
+    from services.recorder.config import RecorderConfig
+    from services.recorder.service import RecorderService
+
+    recorder = RecorderService(Hub(TreedockConfig()).context("recorder"), RecorderConfig(mcap=False))
+    rig = Rig(config())
+    recorder.take(SLAM_POSE, rig._pose(0.0, "tracking", 0, "map-1"))
+    for topic in (SECOND_POSE, FUSION_POSE):
+        assert topic.beside
+        recorder.take(topic, rig._pose(0.1, "tracking", 0, "another"))
+    assert recorder._chronicle._story.map_id == "map-1"
+
+
 def test_the_second_camera_has_keys_of_its_own() -> None:
     tree = TreedockConfig(fusion=FusionConfig(enabled=True, second=SecondCameraConfig(enabled=True)))
     hub = Hub(tree)
