@@ -113,6 +113,7 @@ class Slam:
         accel_camera, attitude_up_camera = gravity.direction(accel_camera), gravity.direction(attitude_up_camera)
         features = self._extractor.extract(grey, depth_m)
         self._lag.begin(depth_m, depth_after_s)
+        self.crew.keep_up()
         with self.crew.frame():
             if self.graph_version == 0:
                 return self._initialise(stamp_ns, features, depth_m, accel_camera, attitude_up_camera)

@@ -25,6 +25,9 @@ Job = Callable[[], None]
 _SWITCH_S = 0.0005
 """How long a thread may keep Python to itself: the default of 5 ms would be added to a frame's time."""
 _CLOSE_S = 0.3
+_MOST_UNFINISHED = 2
+"""Keyframes that may be in the map before the mapping of the first of them is done."""
+_PATIENCE_S = 0.6
 _NICE = 10
 """Where cores are few tracking runs first (Linux: per thread)."""
 
@@ -54,6 +57,10 @@ class Crew(Protocol):
         """Whether nothing is being done and nothing waits."""
         ...
 
+    def keep_up(self) -> bool:
+        """Wait, for a while, until few jobs are unfinished; return whether there was anything to wait for."""
+        ...
+
     def close(self) -> None:
         """Stop: what waits is forgotten."""
         ...
@@ -76,6 +83,10 @@ class Inline:
     def submit(self, job: Job) -> None:
         """Do the job."""
         job()
+
+    def keep_up(self) -> bool:
+        """Return at once: nothing is ever behind."""
+        return False
 
     def close(self) -> None:
         """Nothing runs."""
@@ -145,6 +156,18 @@ class Beside:
             self._owner = None
             self._turn.notify_all()
 
+    def keep_up(self) -> bool:
+        """Let mapping catch up before the next frame: keyframes laid on keyframes that nobody has adjusted go astray.
+
+        Where processors are short frames are dropped instead, and after ``_PATIENCE_S`` one is taken all the same: whoever
+        flies by the poses must see that they come late.
+        """
+        with self._turn:
+            if self._unfinished <= _MOST_UNFINISHED:
+                return False
+            self._turn.wait_for(lambda: self._unfinished <= _MOST_UNFINISHED or self._fault is not None, _PATIENCE_S)
+            return True
+
     def submit(self, job: Job) -> None:
         """Queue a job."""
         with self._turn:
@@ -165,7 +188,10 @@ class Beside:
                 job()
             except Exception as error:
                 LOG.exception("a mapping job failed")
-                self._fault = error
+                with self._turn:
+                    self._fault = error
+                    self._turn.notify_all()
                 return
             with self._turn:
                 self._unfinished -= 1
+                self._turn.notify_all()

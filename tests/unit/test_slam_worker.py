@@ -79,6 +79,27 @@ def test_a_failed_job_is_raised_by_the_next_frame() -> None:
                 time.sleep(0.01)
 
 
+def test_a_frame_waits_for_mapping_that_has_fallen_behind() -> None:
+    crew, go = Beside(), threading.Event()
+
+    def job() -> None:
+        go.wait(30.0)
+
+    crew.submit(job)
+    crew.submit(job)
+    assert not crew.keep_up(), "two keyframes may be on their way"
+    crew.submit(lambda: None)
+    begin_s = time.monotonic()
+    assert crew.keep_up()
+    assert time.monotonic() - begin_s > 0.3, "it waits"
+    with crew.frame():
+        pass  # and the frame is taken all the same: nobody flies blind because mapping hangs
+    go.set()
+    settle(crew)
+    assert not crew.keep_up()
+    crew.close()
+
+
 def test_a_turn_is_held_and_closed_with_mapping_beside_tracking() -> None:
     crew = Beside()
     slam = Slam(INTRINSICS, CONFIG, crew=crew)
