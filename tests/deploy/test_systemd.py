@@ -31,7 +31,7 @@ PrivateTmp=no
 CapabilityBoundingSet=CAP_DAC_OVERRIDE
 Environment=NUMBA_CACHE_DIR={cache} PYTHONPATH={root}
 """
-NAMES = tuple(unit.name for unit in units.UNITS if not unit.ground)
+NAMES = tuple(unit.name for unit in units.UNITS if not unit.ground and not unit.optional)
 
 
 @pytest.fixture(scope="module")
