@@ -83,14 +83,16 @@ def _load(ground: Ground, load: Load, seconds: float, tell: Callable[[str], None
         load.go(on=True)
         until(lambda: counted() > 500, 30.0)
         load.go(on=False)
-        sent, before = load.sent, _at_rest(counted)
+        before = _at_rest(counted)
+        sent = load.sent
         page = psutil.Process(ground.processes["station"].pid)
         cpu_s, begin_s = sum(page.cpu_times()[:2]), time.monotonic()
         load.go(on=True)
         fps = _frame_rate(ground, seconds)
         load.go(on=False)
         used_s, took_s = sum(page.cpu_times()[:2]) - cpu_s, time.monotonic() - begin_s
-        lost = (load.sent - sent) - (_at_rest(counted) - before)
+        taken = _at_rest(counted) - before
+        lost = (load.sent - sent) - taken
         load.go(on=True)
         figures = {
             "messages_sent": load.sent - sent, "messages_lost": lost, "cpu_cores": round(used_s / took_s, 3),
