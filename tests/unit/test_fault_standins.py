@@ -34,9 +34,10 @@ class World:
         listener.on(TREES_TARGET, self.targets.append)
         listener.on(TREES_LIST, self.lists.append)
 
-    def truth(self, seq: int) -> None:
+    def truth(self, seq: int, yaw_rad: float = 0.0) -> None:
+        pose = to_transform(level_camera([0.1 * seq, 0.0, 1.5], yaw_rad))
         self.says.publish(SIM_TRUTH, SimTruth(
-            stamp_ns=stamp(seq), seq=seq, scene="x", T_map_camera=to_transform(level_camera([0.1 * seq, 0.0, 1.5], 0.0)),
+            stamp_ns=stamp(seq), seq=seq, scene="x", T_map_camera=pose,
             trees=(TREE,), touched=0, clearance_m=1.0,
         ))  # fmt: skip
 
@@ -92,3 +93,14 @@ def test_the_tree_is_listed_and_the_target_is_the_missions() -> None:
     seen = [r for r in ranges if r is not None]
     assert len(seen) >= 7
     assert abs(np.median([r - (2.0 - 0.1 * seq) for seq, r in enumerate(ranges, 1) if r is not None])) < 0.15
+
+
+@pytest.mark.parametrize("turn_rad", [-0.2, 0.2])
+def test_every_list_holds_the_tree_whichever_way_the_aircraft_turns(turn_rad: float) -> None:
+    world = World()
+    for seq in range(0, 90, 15):
+        world.truth(seq, turn_rad * seq / 15)
+        world.frame(seq)
+        world.hub.run()
+    assert len(world.lists) >= 4
+    assert all([t.id for t in trees.trees] == [0] for trees in world.lists)

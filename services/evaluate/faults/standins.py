@@ -43,9 +43,9 @@ M = TypeVar("M", Pose, Target, TreeList)
 
 ERRORS = ChainErrors(
     frame_s=1e-6, delay_min_s=0.0, delay_max_s=0.0, drop_share=0.0, loop_m=0.0, loop_rad=0.0, list_s=0.0,
-    listed_after_rad=0.0,
+    listed_after_rad=-np.inf,
 )  # fmt: skip
-"""Delays and lost frames are the processes' own; the map has no loop to close, as it is that of a slam started again."""
+"""Trees are listed from the start, whichever way it turns (a turn to the right counts as negative); delays and lost frames are the processes' own; the map has no loop to close, as it is that of a slam started again."""
 _KEPT = 64
 
 
