@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from services.cli.service_command import SERVICES
+from services.cli.service_command import OPTIONAL, SERVICES
 from services.evaluate.faults.page import PAGE, rendered
 from services.evaluate.faults.rows import ROWS
 
@@ -14,7 +14,7 @@ def test_the_page_shows_the_rows_as_they_are() -> None:
 def test_every_process_is_killed_and_stopped() -> None:
     names = {row.name for row in ROWS}
     assert len(names) == len(ROWS)
-    for service in {*SERVICES, "station"} - {"simulator"}:
+    for service in {*SERVICES, *OPTIONAL, "station"} - {"simulator"}:
         assert {f"kill -9 {service}", f"SIGSTOP {service}"} <= names
     for service in ("camera", "slam", "mapper", "detector", "refiner"):
         assert {f"kill -9 {service} (real)", f"SIGSTOP {service} (real)"} <= names

@@ -9,10 +9,20 @@ from schemas.camera import Intrinsics, RgbdFrame
 from schemas.navigation import MissionState
 from schemas.simulation import SimTruth, TrueTree
 from schemas.slam import Pose
-from schemas.topics import CAMERA_RGBD, MISSION_STATE, SIM_TRUTH, SLAM_POSE, TREES_LIST, TREES_TARGET
+from schemas.topics import (
+    CAMERA_RGBD,
+    MISSION_STATE,
+    SECOND_POSE,
+    SECOND_RGBD,
+    SIM_TRUTH,
+    SLAM_POSE,
+    TREES_LIST,
+    TREES_TARGET,
+    Topic,
+)
 from schemas.trees import Target, TreeList
 from services.common.config import TreedockConfig
-from services.common.geometry import level_camera, to_transform
+from services.common.geometry import from_transform, level_camera, to_transform
 from services.common.memory import Hub
 from services.evaluate.faults.standins import BUILDS
 
@@ -28,9 +38,11 @@ class World:
         self.says = self.hub.context("simulator")
         listener = self.hub.context("listener")
         self.poses: list[Pose] = []
+        self.seconds: list[Pose] = []
         self.targets: list[Target] = []
         self.lists: list[TreeList] = []
         listener.on(SLAM_POSE, self.poses.append)
+        listener.on(SECOND_POSE, self.seconds.append)
         listener.on(TREES_TARGET, self.targets.append)
         listener.on(TREES_LIST, self.lists.append)
 
@@ -41,8 +53,8 @@ class World:
             trees=(TREE,), touched=0, clearance_m=1.0,
         ))  # fmt: skip
 
-    def frame(self, seq: int) -> None:
-        self.says.publish(CAMERA_RGBD, RgbdFrame(
+    def frame(self, seq: int, camera: Topic = CAMERA_RGBD) -> None:
+        self.says.publish(camera, RgbdFrame(
             stamp_ns=stamp(seq), seq=seq, intrinsics=INTRINSICS, colour=bytes(8 * 6 * 3), depth=bytes(8 * 6 * 2),
         ))  # fmt: skip
 
@@ -104,3 +116,17 @@ def test_every_list_holds_the_tree_whichever_way_the_aircraft_turns(turn_rad: fl
         world.hub.run()
     assert len(world.lists) >= 4
     assert all([t.id for t in trees.trees] == [0] for trees in world.lists)
+
+
+def test_the_second_slam_says_where_a_camera_is_that_looks_down_from_the_same_aircraft() -> None:
+    world = World()
+    world.truth(0)
+    world.frame(0, SECOND_RGBD)
+    world.hub.run()
+    assert not world.poses
+    (second,) = world.seconds
+    assert second.stamp_ns == stamp(0)
+    assert second.T_map_camera is not None
+    T = from_transform(second.T_map_camera)
+    assert np.allclose(T[:3, 2], (0.0, 0.0, -1.0), atol=0.05), "it looks at the ground"
+    assert np.allclose(T[:3, 3], (0.0, 0.0, 1.5), atol=0.2)

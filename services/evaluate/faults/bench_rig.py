@@ -14,7 +14,7 @@ import numpy as np
 
 from services.common.errors import InputError
 from services.evaluate.faults.missions import Flights
-from services.evaluate.faults.rig import ONBOARD, Rig
+from services.evaluate.faults.rig import FUSED, ONBOARD, Rig
 from services.evaluate.faults.system import flight_config
 from services.evaluate.faults.verdict import Limits
 
@@ -55,16 +55,20 @@ class Bench:
         folder.mkdir(parents=True, exist_ok=True)
         return folder
 
-    def flights(self, row: str) -> Flights:
-        """Return the missions, on a system that is up and whole, with an aircraft that flies or stands where it may start."""
+    def flights(self, row: str, *, fused: bool = False) -> Flights:
+        """Return the missions, on a system that is up and whole, with an aircraft that flies or stands where it may start.
+
+        ``fused``: with fusion and a second camera aboard.
+        """
+        if self._flights is not None and (FUSED[0] in self._flights.rig.services) != fused:
+            self.close()
         if self._flights is not None and self._flights.cramped:
             self.tell("the aircraft landed beside a tree: another begins at the start")
             self.close()
         if self._flights is None:
             folder = self.fresh()
-            rig = self._stack.enter_context(
-                Rig(flight_config(self.seed, folder), folder, (*ONBOARD, *GROUND, "simulator"))
-            )
+            services = (*ONBOARD, *(FUSED if fused else ()), *GROUND, "simulator")
+            rig = self._stack.enter_context(Rig(flight_config(self.seed, folder, fused=fused), folder, services))
             if not rig.until(lambda: rig.all_ready, _READY_WITHIN_S):
                 raise InputError(f"not ready within {_READY_WITHIN_S:.0f} s: see {folder}")
             self._flights = Flights(rig, self.rng(row), self.tell)

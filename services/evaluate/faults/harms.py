@@ -24,7 +24,7 @@ from services.evaluate.faults.flown import ENDED
 from services.evaluate.faults.killing import passing
 from services.evaluate.faults.missions import Back, Flights
 from services.evaluate.faults.model import Result, Row
-from services.evaluate.faults.rig import ONBOARD, Rig
+from services.evaluate.faults.rig import FUSED, ONBOARD, Rig
 from services.evaluate.faults.system import flight_config
 
 _STALL_S = 0.7
@@ -240,7 +240,7 @@ def _corrupt_config(bench: Bench) -> Result:
     text = TreedockConfig().model_dump_json()
     failed, slowest = list[str](), 0.0
     kinds = list(_damaged(rng, text))
-    services = (*ONBOARD, "preview", "station", "simulator")
+    services = (*ONBOARD, *FUSED, "preview", "station", "simulator")
     for k, service in enumerate(services):
         kind = kinds[k % len(kinds)]
         path = folder / f"{service}.json"

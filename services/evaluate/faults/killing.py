@@ -10,6 +10,7 @@ from services.evaluate.faults.bench_rig import Bench
 from services.evaluate.faults.flown import ENDED
 from services.evaluate.faults.missions import Back, Flights, Seen, line_of
 from services.evaluate.faults.model import Result, Row
+from services.evaluate.faults.rig import FUSED
 from services.evaluate.faults.verdict import common, faults_of, summary
 
 _RESPONSE = {
@@ -21,6 +22,7 @@ _RESPONSE = {
     "autopilot": "PX4 leaves offboard after its own 1.2 s and lands; the bridge that comes back stays silent",
     "recorder": "fly on", "preview": "fly on", "station": "fly on; hold when it is away for 5 s",
     "router": "hold while nobody hears anybody, or fly on; the others stay alive and join again",
+    "fusion": "hold at once, land after 1.2 s", "second_camera": "fly on", "second_slam": "fly on",
 }  # fmt: skip
 _AFTER_DOCKING = frozenset({"docked", "undock", "return", "landing"})
 SIGNALS = {"kill -9": signal.SIGKILL, "SIGSTOP": signal.SIGSTOP}
@@ -30,19 +32,22 @@ def rows() -> list[Row]:
     """Return the rows: each process killed, each process stopped."""
     return [
         Row(
-            f"{how} {service}", "flight", f"{how} of {service} at three random moments of missions",
+            f"{how} {service}", "flight",
+            f"{how} of {service} at three random moments of missions" + " with fusion and a second camera" * (service in FUSED),
             response if how == "kill -9" else f"{response}; noticed within 11.5 s",
             partial(_strike, service=service, how=how),
         )
+        for services in (set(_RESPONSE) - set(FUSED), FUSED)
         for how in SIGNALS
         for service, response in _RESPONSE.items()
+        if service in services
     ]  # fmt: skip
 
 
 def _strike(bench: Bench, service: str, how: str) -> Result:
     seen, failed = [], []
     for _ in range(bench.moments):
-        flights = bench.flights(f"{how} {service}")
+        flights = bench.flights(f"{how} {service}", fused=service in FUSED)
         flights.moment()
         others = _pids(flights.rig.supervisor.children, service)
         one = flights.strike(service, SIGNALS[how])

@@ -11,7 +11,7 @@ _WHERE = {
     "flight": (
         "Missions in flight",
         "Router, recorder, preview, station, camera, navigator, autopilot and the simulator with its PX4 are the real processes "
-        "under the real supervisor; slam, mapper, detector and refiner are stand-ins that say what the real ones would say, with "
+        "under the real supervisor; slam (also the second camera's), mapper, detector and refiner are stand-ins that say what the real ones would say, with "
         "measured errors (`services/evaluate/faults/standins.py`), so that a mission costs a few seconds. Each fault strikes at a "
         "random moment between the start command and docking; a mission that it does not end gets the next one.",
     ),

@@ -25,7 +25,9 @@ from services.common.session import opened_client
 from services.evaluate.faults.flown import Flown
 
 ONBOARD = ("router", "recorder", "camera", "slam", "mapper", "detector", "refiner", "navigator", "autopilot")
-STANDINS = frozenset({"slam", "mapper", "detector", "refiner"})
+FUSED = ("fusion", "second_camera", "second_slam")
+"""What flies only where the configuration says so."""
+STANDINS = frozenset({"slam", "mapper", "detector", "refiner", "second_slam"})
 _LOOK_S = 0.02
 _ROUTER_WITHIN_S = 240.0
 _READY = frozenset({"ready", "degraded"})

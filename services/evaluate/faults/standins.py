@@ -1,4 +1,4 @@
-"""Stand-ins for slam, mapper, detector and refiner, each a process of its own: they say what the real ones would say.
+"""Stand-ins for slam, mapper, detector, refiner and the second slam, each a process of its own: they say what the real ones would say.
 
 ``python -m services.evaluate.faults.standins NAME --config FILE --parent PID``. They live by the camera's frames as the real
 ones do (no frame, no pose) but read the truth in place of the pictures, with the errors of ``services.evaluate.synthetic``. So
@@ -24,20 +24,24 @@ from schemas.topics import (
     CAMERA_COMPRESSED,
     CAMERA_RGBD,
     MISSION_STATE,
+    SECOND_POSE,
+    SECOND_RGBD,
     SIM_TRUTH,
     SLAM_POSE,
     TREES_LIST,
     TREES_TARGET,
+    Topic,
 )
 from schemas.trees import Target, TreeList
 from services.cli.service_command import end_with
 from services.common.config import load_config
 from services.common.context import Context
-from services.common.geometry import from_transform
+from services.common.geometry import from_transform, inverse, to_transform
 from services.common.process import prepare_process
 from services.common.runtime import run_service
 from services.common.stop import end_process
 from services.evaluate.synthetic import ChainErrors, SyntheticChain, TrueTrunk
+from services.navigator.autopilot.frames import Mount
 
 M = TypeVar("M", Pose, Target, TreeList)
 
@@ -84,11 +88,11 @@ class Standin:
 class StandinSlam(Standin):
     """A pose for each frame, once both the frame and its truth are there."""
 
-    def __init__(self, context: Context) -> None:
+    def __init__(self, context: Context, frames: Topic | None = None) -> None:
         super().__init__(context)
         self._frame_ns = 0
         compressed = context.config.slam.frames == "compressed"
-        context.on(CAMERA_COMPRESSED if compressed else CAMERA_RGBD, self._on_frame)
+        context.on(frames or (CAMERA_COMPRESSED if compressed else CAMERA_RGBD), self._on_frame)
 
     def _on_frame(self, frame: RgbdFrame) -> None:
         self._frame_ns = frame.stamp_ns
@@ -103,7 +107,29 @@ class StandinSlam(Standin):
         pose = self.said(self._frame_ns, Pose)
         if pose is not None:
             self._frame_ns = 0
-            self.context.publish(SLAM_POSE, pose)
+            self.publish(pose)
+
+    def publish(self, pose: Pose) -> None:
+        """Say a pose of the first camera."""
+        self.context.publish(SLAM_POSE, pose)
+
+
+class StandinSecondSlam(StandinSlam):
+    """The same for the second camera, which is bolted to the first."""
+
+    def __init__(self, context: Context) -> None:
+        super().__init__(context, SECOND_RGBD)
+        autopilot, second = context.config.autopilot, context.config.fusion.second
+        first = Mount.level(autopilot.camera_offset_m, autopilot.camera_pitch_rad, autopilot.camera_yaw_rad)
+        of_second = Mount.level(second.offset_m, second.pitch_rad, second.yaw_rad)
+        self._T_first_second = inverse(first.T_body_camera) @ of_second.T_body_camera
+
+    def publish(self, pose: Pose) -> None:
+        """Say where the second camera is while the first is at ``pose``."""
+        if pose.T_map_camera is not None:
+            T_map_second = from_transform(pose.T_map_camera) @ self._T_first_second
+            pose = pose.model_copy(update={"T_map_camera": to_transform(T_map_second)})
+        self.context.publish(SECOND_POSE, pose)
 
 
 class StandinRefiner(Standin):
@@ -152,6 +178,7 @@ def _mapper(context: Context) -> None:
 
 BUILDS: dict[str, Callable[[Context], object]] = {
     "slam": StandinSlam, "mapper": _mapper, "detector": StandinDetector, "refiner": StandinRefiner,
+    "second_slam": StandinSecondSlam,
 }  # fmt: skip
 
 

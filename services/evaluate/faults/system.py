@@ -5,8 +5,10 @@ from __future__ import annotations
 import socket
 from pathlib import Path
 
+from services.camera.config import CameraConfig
 from services.common.config import TreedockConfig
 from services.common.session import free_port
+from services.fusion.config import FusionConfig, SecondCameraConfig
 from services.simulator.config import FlightConfig, SensorConfig
 from services.simulator.px4.config import LinkConfig, Px4Config
 from services.station.launch import with_station
@@ -15,10 +17,10 @@ SPEED = 4.0
 """Simulated seconds a second at most; a busy machine is slower, and so is a flight in which somebody is missing."""
 
 
-def flight_config(seed: int, folder: Path, *, speed: float = SPEED) -> TreedockConfig:
+def flight_config(seed: int, folder: Path, *, speed: float = SPEED, fused: bool = False) -> TreedockConfig:
     """Return the configuration of missions without rendering, one after the other in one simulation.
 
-    The forest is drawn from ``seed``; ``speed``: simulated seconds a second at most.
+    The forest is drawn from ``seed``; ``speed``: simulated seconds a second at most; ``fused``: with fusion and a second camera.
     """
     base = TreedockConfig()
     port = _free_udp_port()
@@ -38,8 +40,14 @@ def flight_config(seed: int, folder: Path, *, speed: float = SPEED) -> TreedockC
         "autopilot": base.autopilot.model_copy(update={"connection": f"udpin:127.0.0.1:{port}"}),
         "recorder": base.recorder.model_copy(update={"folder": folder / "recordings", "reserve_mb": 0}),
         "simulator": simulator,
+        "fusion": _fusion() if fused else base.fusion,
     })  # fmt: skip
     return with_station(tree, folder)
+
+
+def _fusion() -> FusionConfig:
+    """Return fusion of slam, the autopilot's IMU and a second camera that looks down."""
+    return FusionConfig(enabled=True, second=SecondCameraConfig(enabled=True, camera=CameraConfig(source="sim")))
 
 
 def _free_udp_port() -> int:

@@ -70,7 +70,7 @@ def hold_within_s(service: str, state: str) -> float | None:
     """Return within how many seconds somebody must hold or land; None: the flight does not need that service then."""
     if state not in _MOVING:
         return None
-    if service in {"slam", "camera", "navigator"}:
+    if service in {"slam", "fusion", "camera", "navigator"}:
         return HOLD_S
     if service == "autopilot":
         return PX4_LEAVES_S
