@@ -5,40 +5,14 @@ Nothing heavy is imported here: ``treedock --help`` answers at once.
 
 from __future__ import annotations
 
-import importlib
 import sys
-from importlib.util import find_spec
 from typing import Annotated, Any
 
 import typer
 
-from services.cli.certs import certs_app
-from services.cli.config_command import config
-from services.cli.fleet import fleet_app
-from services.cli.inventory import inventory_app
-from services.cli.run import run
-from services.cli.service_command import OPTIONAL, SERVICES, service_command
-from services.cli.topic import topic_app
+from services.cli.commands import add_command, add_name, names
 from services.common.errors import GoalNotReachedError, InputError
 from services.common.process import prepare_process
-
-COMMAND_MODULES = (
-    "process",
-    "detect",
-    "simulate",
-    "calibrate",
-    "catalogue",
-    "bench",
-    "warm",
-    "command",
-    "station",
-    "record",
-    "recordings",
-    "replay",
-    "view",
-    "doctor",
-)
-"""Modules beside this one that hold one command of the same name each."""
 
 EXIT_DONE, EXIT_BUG, EXIT_INPUT, EXIT_NO_GOAL, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -46,8 +20,8 @@ _USAGE_ERROR: Any = typer.BadParameter.__mro__[1]
 """UsageError of the click inside this typer: newer ones carry their own, so `import click` gives another class."""
 
 
-def make_app() -> typer.Typer:
-    """Return the command line with all its commands."""
+def make_app(called: str | None = None) -> typer.Typer:
+    """Return the command line that serves a call of the command ``called``; the list of all names when it is none of them."""
     app = typer.Typer(
         name="treedock",
         help="Find the trees around a small aircraft with one RGB-D camera, and guide it up to them.",
@@ -56,18 +30,12 @@ def make_app() -> typer.Typer:
         add_completion=False,
     )
     app.callback()(_options)
-    app.command()(run)
-    for name in COMMAND_MODULES:
-        if find_spec(f"services.cli.{name}") is not None:
-            module = importlib.import_module(f"services.cli.{name}")
-            app.command(name)(getattr(module, name))
-    app.add_typer(topic_app, name="topic")
-    app.add_typer(inventory_app, name="inventory")
-    app.add_typer(fleet_app, name="fleet")
-    app.add_typer(certs_app, name="certs")
-    app.command()(config)
-    for name, about in (SERVICES | OPTIONAL).items():
-        app.command(name, help=about, rich_help_panel="Services (each its own process)")(service_command(name))
+    known = names()
+    if called in known:
+        add_command(app, called)
+    else:
+        for name in known:
+            add_name(app, name)
     return app
 
 
@@ -97,7 +65,7 @@ def main() -> None:
 def invoke(arguments: list[str]) -> int:
     """Run one command and return its exit code."""
     try:
-        result = make_app()(arguments, prog_name="treedock", standalone_mode=False)
+        result = make_app(next(iter(arguments), None))(arguments, prog_name="treedock", standalone_mode=False)
     except InputError as error:
         return _tell(str(error), EXIT_INPUT)
     except GoalNotReachedError as error:
