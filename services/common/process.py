@@ -12,6 +12,8 @@ import threading
 from collections.abc import Mapping
 from pathlib import Path
 
+from services.common.kernel_cache import drop_stale
+
 _PR_SET_PDEATHSIG = 1
 BACKGROUND: Mapping[str, int] = {"mapper": 10, "detector": 10, "recorder": 10, "preview": 10}
 """Niceness of services that may be late: nobody flies by them within a frame. Under systemd CPUWeight does the same."""
@@ -21,12 +23,13 @@ _USUAL = gc.get_threshold()
 
 
 def prepare_process() -> None:
-    """Set what heavy libraries read at import: a writable numba cache, one thread each, no search for plugins.
+    """Set what heavy libraries read at import: a writable numba cache without stale kernels, one thread each, no search for plugins.
 
     The garbage collector looks seldom until ``started``.
     """
     # beside the code the cache would need write access that a deployment does not give
     os.environ.setdefault("NUMBA_CACHE_DIR", str(_kernel_cache()))
+    drop_stale(Path(os.environ["NUMBA_CACHE_DIR"]), Path(__file__).absolute().parents[2])
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
         os.environ.setdefault(name, "1")
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
