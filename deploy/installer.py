@@ -162,9 +162,9 @@ def source_hash(source: Path = SOURCE) -> str:
 def _activation(options: Options) -> Iterator[Action]:
     cache = f"NUMBA_CACHE_DIR=/var/cache/{USER}/numba"
     yield Run(
-        ("runuser", "-u", USER, "--", "env", cache, f"{options.prefix}/bin/treedock", "warm"),
-        "compile the kernels once, so that services start at once",
-    )
+        ("runuser", "-u", USER, "--", "env", cache, f"{options.prefix}/bin/treedock", "warm", "--aboard"),
+        "compile the kernels once, so that services start at once", needed=options.role == "aircraft",
+    )  # fmt: skip
     # not in an image that is being made: its units are read when it boots
     yield Run(("systemctl", "daemon-reload"), "read the units", needed=BOOTED.is_dir())
     yield Run(("udevadm", "control", "--reload"), "read the device rules", may_fail=True)

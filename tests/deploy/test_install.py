@@ -189,6 +189,18 @@ def test_packages_are_installed_again_only_when_something_changed(
     assert not kernels.exists()
 
 
+def test_only_an_aircraft_compiles_kernels_and_only_those_that_it_runs(tmp_path: Path) -> None:
+    warming = {}
+    for role in ("aircraft", "station"):
+        actions_now = installer._activation(options(tmp_path, "--role", role))
+        warming[role] = [
+            a.command for a in actions_now if isinstance(a, actions.Run) and "warm" in a.command and a.needed
+        ]
+    assert [command[-2:] for command in warming["aircraft"]] == [("warm", "--aboard")]
+    assert warming["station"] == []
+    assert not any(unit.compiles for unit in units.UNITS if unit.ground or unit.name == "router")
+
+
 def test_the_source_is_known_by_every_byte_and_name(tmp_path: Path) -> None:
     for name in ("pyproject.toml", "constraints.txt", "schemas/a.py", "services/x/b.py"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)

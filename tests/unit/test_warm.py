@@ -10,6 +10,8 @@ from collections.abc import Iterator
 import pytest
 from numba.core.dispatcher import Dispatcher
 
+from services.cli import warm
+
 APART = {
     "services.slam.vocabulary.assign": "makes the vocabulary that is shipped",
 }
@@ -24,6 +26,10 @@ def test_warm_leaves_no_kernel_that_python_calls_uncompiled(package: str) -> Non
     importlib.import_module(f"services.{package}.warm").warm()
     cold = {name for name, kernel in _called_by_python(f"services.{package}") if not kernel.signatures}
     assert cold <= set(APART), f"{sorted(cold - set(APART))} would compile in flight"
+
+
+def test_aboard_all_of_them_are_warmed() -> None:
+    assert set(warm.PACKAGES) - warm.NOT_ABOARD == {f"services.{package}" for package in PACKAGES}
 
 
 def _called_by_python(package: str) -> Iterator[tuple[str, Dispatcher]]:
