@@ -105,7 +105,7 @@ class Run:
 
     def describe(self) -> str:
         """Return the line for the person who watches."""
-        return f"{'run    ' if self.needed else 'done   '} {' '.join(self.command)}   ({self.why})"
+        return f"run     {' '.join(self.command)}   ({self.why})" if self.needed else f"have    {self.why}"
 
     def do(self) -> None:
         """Do it."""

@@ -25,6 +25,8 @@ SOURCE = Path(__file__).resolve().parents[1]
 USER = "treedock"
 UNIT_FOLDER = "etc/systemd/system"
 CONFIG = "etc/treedock/10-treedock.toml"
+CONFIG_OF = {"aircraft": "10-treedock.toml", "station": "station.toml"}
+TARGET_OF = {"aircraft": "treedock.target", "station": "treedock-station.target"}
 COMMAND = "usr/local/bin/treedock"
 MEMORY_LOCK = f"{UNIT_FOLDER}/treedock-.service.d/10-memory-lock.conf"
 BOOTED = Path("/run/systemd/system")
@@ -70,7 +72,7 @@ def installation(options: Options) -> Iterator[Action]:
     yield Folder(options.at("/etc/treedock"))
     certs = Folder(options.at("/etc/treedock/certs"), 0o700, USER if options.live else "")
     yield certs
-    config = (SOURCE / "deploy/etc/10-treedock.toml").read_text().replace("@UAV@", options.uav)
+    config = (SOURCE / "deploy/etc" / CONFIG_OF[options.role]).read_text().replace("@UAV@", options.uav)
     yield Write(options.at(CONFIG), config, keep=True)
     yield Write(options.at(RULES), (SOURCE / "deploy/udev/60-treedock.rules").read_text())
     for name, text in units.files(options.prefix).items():
@@ -161,17 +163,17 @@ def source_hash(source: Path = SOURCE) -> str:
 
 def _activation(options: Options) -> Iterator[Action]:
     cache = f"NUMBA_CACHE_DIR=/var/cache/{USER}/numba"
-    yield Run(
-        ("runuser", "-u", USER, "--", "env", cache, f"{options.prefix}/bin/treedock", "warm", "--aboard"),
-        "compile the kernels once, so that services start at once", needed=options.role == "aircraft",
-    )  # fmt: skip
-    # not in an image that is being made: its units are read when it boots
-    yield Run(("systemctl", "daemon-reload"), "read the units", needed=BOOTED.is_dir())
+    if options.role == "aircraft":
+        yield Run(
+            ("runuser", "-u", USER, "--", "env", cache, f"{options.prefix}/bin/treedock", "warm", "--aboard"),
+            "compile the kernels once, so that services start at once",
+        )
+    if BOOTED.is_dir():  # not in an image that is being made: its units are read when it boots
+        yield Run(("systemctl", "daemon-reload"), "read the units")
     yield Run(("udevadm", "control", "--reload"), "read the device rules", may_fail=True)
-    target = "treedock-station.target" if options.role == "station" else "treedock.target"
     if options.enable:
         now = ("--now",) if BOOTED.is_dir() else ()
-        yield Run(("systemctl", "enable", *now, target), "start now and at every boot")
+        yield Run(("systemctl", "enable", *now, TARGET_OF[options.role]), "start now and at every boot")
 
 
 def removal(options: Options) -> Iterator[Action]:
@@ -246,7 +248,12 @@ def parse(arguments: Sequence[str]) -> tuple[str, Options]:
     parser.add_argument("--prefix", default=units.PREFIX, help="place of the private environment (default %(default)s)")
     parser.add_argument("--root", type=Path, default=Path("/"), help="stage below this folder instead of installing")
     parser.add_argument("--uav", default="uav1", help="the aircraft's name, a part of every key (default %(default)s)")
-    parser.add_argument("--role", choices=("aircraft", "station"), default="aircraft", help="what --enable starts")
+    parser.add_argument(
+        "--role",
+        choices=("aircraft", "station"),
+        default="aircraft",
+        help="what is configured, compiled and started (default %(default)s)",
+    )
     parser.add_argument("--wheels", type=Path, help="folder of wheels for a machine without a network")
     parser.add_argument("--no-realsense", action="store_true", help="leave out the RealSense camera's library")
     parser.add_argument("--enable", action="store_true", help="start now and at every boot")
@@ -282,7 +289,8 @@ def main(arguments: Sequence[str]) -> int:
         sys.stderr.write(f"deploy/install: {error}\n")
         return 2
     if verb == "install" and not options.dry_run and not options.enable and options.live:
-        sys.stdout.write(f"installed; look at {options.at(CONFIG)}, then: systemctl enable --now treedock.target\n")
+        target = TARGET_OF[options.role]
+        sys.stdout.write(f"installed; look at {options.at(CONFIG)}, then: systemctl enable --now {target}\n")
     return 0
 
 

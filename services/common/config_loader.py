@@ -93,7 +93,8 @@ def _flatten(body: Mapping[str, object], model: type[BaseModel] | None, prefix: 
         key = f"{prefix}{name}"
         section = _section(model, name) if model else None
         unknown = model is None or name not in model.model_fields
-        if (section is not None or unknown) and isinstance(value, Mapping) and value:
+        # a section of which every line is a comment says nothing; one that is unknown is refused also when it is empty
+        if isinstance(value, Mapping) and (section is not None or (unknown and value)):
             yield from _flatten(value, section, f"{key}.", origin)
         else:
             yield _Setting(key, value, origin)

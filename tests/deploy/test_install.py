@@ -141,8 +141,23 @@ def test_a_staged_installation_is_complete_and_its_configuration_is_read(tmp_pat
     assert found.router.listen_host == "127.0.0.1"
 
 
-def test_the_commented_settings_are_real_ones(tmp_path: Path) -> None:
-    text = (ROOT / "deploy/etc/10-treedock.toml").read_text().replace("@UAV@", "uav1")
+def test_a_station_is_told_what_is_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    staged(tmp_path, "--role", "station", "--uav", "kea-2")
+    assert load(environ={}, system_directory=tmp_path / "etc/treedock").config.uav == "kea-2"
+    text = (tmp_path / installer.CONFIG).read_text()
+    assert "identity" in text
+    assert "autopilot" not in text
+    assert installer.main(["--root", str(tmp_path), "--role", "station", "--dry-run"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert f"keep    {tmp_path / installer.CONFIG}" in said
+    assert all(
+        line.split()[0] in {"run", "have", "write", "same", "keep", "make", "link", "remove", "gone"} for line in said
+    )
+
+
+@pytest.mark.parametrize("role", ["aircraft", "station"])
+def test_the_commented_settings_are_real_ones(tmp_path: Path, role: str) -> None:
+    text = (ROOT / "deploy/etc" / installer.CONFIG_OF[role]).read_text().replace("@UAV@", "uav1")
     lines = [
         line.removeprefix("# ") if line.startswith(("# [", "# ")) and ("=" in line or "# [" in line) else line
         for line in text.splitlines()

@@ -51,6 +51,15 @@ def test_each_source_wins_over_the_one_before(tmp_path: Path) -> None:
     assert found.origins["clock"] == "TREEDOCK_CLOCK"
 
 
+def test_a_section_of_which_every_line_is_a_comment_says_nothing(tmp_path: Path) -> None:
+    own = write(tmp_path, "own.toml", "[router]\n# port = 1003\n[station.fleet]\n")
+    found = load(own, environ={}, system_directory=tmp_path)
+    assert found.config == TreedockConfig()
+    assert found.origins == {}
+    with pytest.raises(InputError, match="rooter"):
+        load(write(tmp_path, "other.toml", "[rooter]\n"), environ={}, system_directory=tmp_path)
+
+
 def test_a_file_can_be_named_by_a_variable(tmp_path: Path) -> None:
     own = write(tmp_path, "own.json", '{"router": {"port": 1010}}')
     assert load(environ={"TREEDOCK_CONFIG": str(own)}, system_directory=tmp_path / "no").config.router.port == 1010
