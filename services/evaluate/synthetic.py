@@ -94,6 +94,8 @@ class SyntheticChain:
         self._lean = exp_rotation(np.array([*(errors.tilt_rad * lasting[1:]), 0.0]))
         self._seen: set[int] = set()
         self._turned_rad = 0.0
+        self._farthest_rad = 0.0
+        """How far the turn ever came: what was seen on the way is not forgotten by turning back."""
         self._last_yaw: float | None = None
         self._next_ns = 0
         self._list_ns = 0
@@ -108,7 +110,7 @@ class SyntheticChain:
     @property
     def closed(self) -> bool:
         """Whether the turn has closed its loop."""
-        return self._turned_rad > 2.0 * np.pi
+        return self._farthest_rad > 2.0 * np.pi
 
     def observe(self, T_world_camera: Matrix, now_ns: int) -> None:
         """Look at the world, when a frame is due."""
@@ -148,6 +150,7 @@ class SyntheticChain:
     def _count_turn(self, yaw_rad: float) -> None:
         if self._last_yaw is not None:
             self._turned_rad += wrap_angle(yaw_rad - self._last_yaw)
+            self._farthest_rad = max(self._farthest_rad, self._turned_rad)
         self._last_yaw = yaw_rad
 
     def _bent(self, p_map: Matrix) -> Matrix:
@@ -228,7 +231,7 @@ class SyntheticChain:
         trees = []
         for i in range(len(self.trunks)):
             near = float(np.linalg.norm(self._trunk_map(i)[:2])) <= e.range_max_m
-            if near and self._turned_rad >= e.listed_after_rad:
+            if near and self._farthest_rad >= e.listed_after_rad:
                 trees.append(self._listed(i))
         return TreeList(
             stamp_ns=stamp_ns, map_id="synthetic", version=self._lists, graph_version=int(self.closed),

@@ -115,10 +115,9 @@ class Claims:
         """Return since when something is wanted that is not held."""
         return 0.0 if self._waiting is None else (self._now_ns - self._waiting[1]) / 1e9
 
-    def given_up(self, tree_ids: set[int]) -> None:
-        """Wait no longer for trees that are done."""
-        for tree_id in tree_ids:
-            self._held_by_others.pop(tree_id, None)
+    def wait_only_for(self, tree_ids: set[int]) -> None:
+        """Wait no longer for other trees: done here, or no longer listed, so that they would never be asked for again."""
+        self._held_by_others = {i: held for i, held in self._held_by_others.items() if i in tree_ids}
 
     @property
     def word(self) -> str:

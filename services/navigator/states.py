@@ -121,7 +121,7 @@ def select(b: Board, since_s: float) -> Result:
     if here is None or since_s < c.select_settle_s:
         return Intent("stop")
     done = {*b.visited_ids, *b.given_up_ids}
-    b.claims.given_up(done)
+    b.claims.wait_only_for({t.id for t in b.trees} - done)
     closed = done | b.claims.closed_ids
     choice = choose(b.trees, here.position_m, closed, b.done_xy_m, c.select_confidence, b.wanted_id)
     if choice.tree is not None:

@@ -88,6 +88,21 @@ def test_it_waits_for_a_tree_that_another_holds_and_says_so() -> None:
     assert world.run("face", 60.0) == "face", "uav2 never renewed"
 
 
+def test_it_does_not_wait_for_a_tree_that_is_no_longer_listed() -> None:
+    world = ClaimsWorld(trees=[tree(1, 3.0, 1.0)])
+    world.start()
+    world.run("scan")
+    world.other_claims(3.05, 1.0)
+    world.run("select")
+    world.run(seconds=5.0)
+    assert world.mission.reason == "waiting: tree 1: uav2 holds this tree"
+    world.trees.clear()
+    world.revision += 1
+    world.run("landing", 10.0)
+    assert world.state == "landing"
+    assert "no suitable tree left among 0 listed" in world.mission.reason
+
+
 def test_it_does_not_wait_for_ever() -> None:
     world = ClaimsWorld(trees=[tree(1, 3.0, 1.0)])
     world.start()
