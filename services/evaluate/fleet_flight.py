@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import itertools
 import random
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -212,6 +213,19 @@ def fleet_case(seed: int, count: int, *, px4: bool = False) -> FleetCase:
         points.append(_start_point(f"uav{k + 1}", start, yaw, plane, rng))
     rates = {name: 1.0 + float(rng.uniform(-_DRIFT, _DRIFT)) for name in ("arbiter", *flights)}
     return FleetCase(seed, flights, tuple(points), _drawn_outages(tuple(flights), rng), rates, px4)
+
+
+def calm_case(
+    trunks: tuple[TrueTrunk, ...], starts: Mapping[str, tuple[float, float]], claims: ClaimConfig
+) -> FleetCase:
+    """Return aircraft that look along x in a forest of one's own: no outages, right clocks, no wind."""
+    navigator = NavigatorConfig(trees_wanted=50, claims=claims, live_guard=False)
+    plane, rng = TangentPlane(*_SITE_DEG), np.random.default_rng(1)
+    flights = {
+        uav: FlightCase(k, trunks, start_m=start, navigator=navigator) for k, (uav, start) in enumerate(starts.items())
+    }
+    points = tuple(_start_point(uav, start, 0.0, plane, rng) for uav, start in starts.items())
+    return FleetCase(0, flights, points, (), dict.fromkeys(("arbiter", *starts), 1.0))
 
 
 def _start_point(

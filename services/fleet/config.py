@@ -43,6 +43,9 @@ class ClaimConfig(BaseModel):
     """With less than this left the aircraft holds: so much is needed to hold, back off and land while still alone."""
     hold_s: float = Field(default=5.0, gt=0.0)
     """Then, without a renewal, it backs off and lands."""
+    give_way_s: float = Field(default=40.0, gt=0.0)
+    """After waiting so long away from its start, longer than another needs for one tree, it flies back there and asks on:
+    two that wait for each other's place would both go home without their trees."""
     wait_s: float = Field(default=90.0, gt=0.0)
     """How long to wait for trees that others hold, or for a free way home, before giving up."""
 

@@ -66,6 +66,8 @@ class Board:
     relocks: int = 0
     relocked_at_rad: float = 0.0
     homeward: bool = False
+    giving_way: bool = False
+    """Flies to its start to make room for others, and chooses on from there."""
     """No further tree: the way leads to the start."""
     dock_direction: Matrix | None = None
     """Unit vector (2,) from the axis to the docking place."""
@@ -103,6 +105,13 @@ class Board:
         """The last tracked pose while slam is trusted, else None."""
         fresh = self.inputs.age_s(self.inputs.pose) <= self.config.failsafe.pose_silent_s
         return self.track.latest if fresh and not self.track.lost else None
+
+    @property
+    def from_home_m(self) -> float:
+        """Horizontal distance from the start; infinite while either place is not known."""
+        if self.here is None or self.home_m is None:
+            return float("inf")
+        return float(np.linalg.norm(self.here.position_m[:2] - self.home_m[:2]))
 
     @property
     def carried(self) -> bool:

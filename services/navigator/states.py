@@ -42,6 +42,8 @@ _GAP_M = 0.025
 _YAW_INTEGRAL_SHARE = 0.4
 _SETTLED_M_S = 0.06
 """Standing offsets are learnt below this speed of the setpoint: while it moves, the aircraft's lag is no offset."""
+_AWAY_M = 0.5
+"""Nearer to its start than this it has nowhere to give way to."""
 _LEAVE_WITHIN_S = 6.0
 """Backing off without a claim takes no longer: the rest of the lease is for coming down."""
 _YAW_CORRECTION_RAD = float(np.radians(8.0))
@@ -127,10 +129,18 @@ def select(b: Board, since_s: float) -> Result:
     if choice.tree is not None:
         return _claimed(b, choice)
     if b.claims.awaited and since_s < c.claims.wait_s:
-        return Intent("stop", word=f"waiting: {b.claims.awaited}")
+        return _wait(b, since_s)
     if since_s < c.select_wait_s and not b.visited_ids and not b.claims.closed_words:
         return Intent("stop")
     return _go_home(b, "; ".join(word for word in (choice.reason, b.claims.awaited, b.claims.closed_words) if word))
+
+
+def _wait(b: Board, since_s: float) -> Result:
+    """Wait for a tree that another holds; not for ever where that other may be waiting for this place."""
+    if since_s >= b.config.claims.give_way_s and b.home_known and b.from_home_m > _AWAY_M:
+        b.giving_way = True
+        return Next("return", f"giving way: {b.claims.awaited}")
+    return Intent("stop", word=f"waiting: {b.claims.awaited}")
 
 
 def _claimed(b: Board, choice: Choice) -> Result:
@@ -232,13 +242,19 @@ def undock(b: Board, since_s: float) -> Result:
 
 
 def return_home(b: Board, since_s: float) -> Result:
-    """Entry: the trees wanted are done. Exit: over the start -> landing; no way or too long -> landing here."""
+    """Entry: the trees wanted are done, or giving way. Exit: over the start -> landing, having given way -> select.
+
+    No way or too long -> landing here.
+    """
     here = b.here
     if here is None:
         return Intent("stop", "freeze")
     if b.home_m is None or not b.home_known:
         return Next("landing", "the start is not known in this map")
-    left = float(np.linalg.norm(here.position_m[:2] - b.home_m[:2]))
+    left = b.from_home_m
+    if left < 0.2 and b.giving_way:
+        b.giving_way = False
+        return Next("select", "gave way: asking on from the start")
     if left < 0.2:
         return Next("landing", f"back at the start within {left:.2f} m")
     if b.claims.on:
@@ -270,7 +286,7 @@ def _go_home(b: Board, reason: str) -> Next:
     if b.config.handheld:
         return Next("landed", reason)
     if b.config.return_home or b.trees_wanted > 1:
-        b.homeward = True
+        b.homeward, b.giving_way = True, False
         if b.axis_m is not None and b.dock_direction is not None:
             return Next("undock", f"{reason}: away from the trunk first")
         return Next("return", reason)

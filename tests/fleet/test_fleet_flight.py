@@ -10,7 +10,9 @@ import pytest
 from schemas.fleet import ClaimGoal
 from services.evaluate import bench_fleet, bench_fleet_capacity
 from services.evaluate.bench import BenchOptions
-from services.evaluate.fleet_flight import FleetFlight, fleet_case
+from services.evaluate.fleet_flight import FleetFlight, calm_case, fleet_case
+from services.evaluate.synthetic import TrueTrunk
+from services.fleet.config import ClaimConfig
 from services.fleet.shapes import Stretch
 
 
@@ -20,6 +22,18 @@ def test_two_aircraft_visit_each_tree_once_over_a_link_that_drops() -> None:
     assert row["once"] == row["expected"] > 0
     assert row["ends"] == ["landed", "landed"]
     assert min(row["shares"]) > 0
+
+
+def test_two_that_wait_for_each_others_place_give_way_and_leave_no_tree() -> None:
+    """Each docks first at a tree that stands too near to the other's last; neither lists the other's last."""
+    at = ((4.3, -1.6), (5.7, 1.6), (3.7, 2.9), (6.3, -2.9))
+    trunks = tuple(TrueTrunk(x, y, 0.1) for x, y in at)
+    fleet = FleetFlight(calm_case(trunks, {"uav1": (0.0, 0.0), "uav2": (10.0, 0.0)}, ClaimConfig(enabled=True)))
+    fleet.run(400.0)
+    assert any(e.after == "return" and "giving way" in e.reason for f in fleet.flights.values() for e in f.events)
+    assert sorted(trunk for _, trunk in fleet.docked) == [0, 1, 2, 3]
+    assert (fleet.double_claims, fleet.met) == (0, 0)
+    assert {f.state for f in fleet.flights.values()} == {"landed"}
 
 
 def test_an_arbiter_that_takes_two_places_for_different_ones_is_found_out() -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from services.navigator.config import DockConfig
+from services.fleet.config import ClaimConfig
+from services.navigator.config import DockConfig, NavigatorConfig
 from tests.fleet.claims_world import ClaimsWorld, ordered
 from tests.unit.navigator_world import World, tree
 
@@ -86,6 +87,26 @@ def test_it_waits_for_a_tree_that_another_holds_and_says_so() -> None:
     assert world.state == "select"
     assert world.mission.reason == "waiting: tree 1: uav2 holds this tree"
     assert world.run("face", 60.0) == "face", "uav2 never renewed"
+
+
+def test_it_gives_way_to_its_start_and_asks_on_from_there() -> None:
+    """The other may be waiting for the place that this one hovers at."""
+    claims = ClaimConfig(enabled=True, give_way_s=10.0)
+    config = NavigatorConfig(claims=claims, live_guard=False, trees_wanted=2)
+    world = ClaimsWorld(config, trees=[tree(1, 4.0, 0.0), tree(2, 4.0, 4.0)])
+    world.start()
+    world.run("dock")
+    world.other_claims(4.0, 4.05)
+    assert world.run("return", 60.0) == "return"
+    assert "giving way: tree 2: uav2 holds this tree" in reasons(world, "return")
+    world.other_claims(4.0, 4.05)
+    assert world.run("select", 60.0) == "select"
+    assert world.mission.board.from_home_m < 0.3
+    world.run(seconds=12.0)
+    assert world.state == "select", "at its start it blocks nobody: there it waits"
+    assert world.run("docked", 120.0) == "docked", "uav2 never renewed"
+    assert world.mission.board.docked_count == 2
+    assert world.run("landed", 120.0) == "landed"
 
 
 def test_it_does_not_wait_for_a_tree_that_is_no_longer_listed() -> None:
