@@ -112,7 +112,7 @@ SLAM_POSE = Topic("slam/pose", Pose, "slam", ("refiner", "detector", "navigator"
                   "interactive_high", radio_hz=5, express=True, description="camera in map for each frame, with covariance")  # fmt: skip
 FUSION_POSE = Topic("fusion/pose", Pose, "fusion", ("navigator", "autopilot"), 15, 0.5, _A, _STREAM, "interactive_high", express=True,
                     beside=True, description="slam's pose, carried on where slam is lost: taken instead of slam/pose while fusion is on")  # fmt: skip
-FUSION_STATE = Topic("fusion/state", FusionState, "fusion", ("evaluate",), 2, 3.0, _R, _STREAM, "data_high", radio_hz=1,
+FUSION_STATE = Topic("fusion/state", FusionState, "fusion", ("station", "evaluate"), 2, 3.0, _R, _STREAM, "data_high", radio_hz=1,
                      description="what carries the pose, whether the GPS is believed, the place on the earth")  # fmt: skip
 SLAM_KEYFRAME = Topic("slam/keyframe", Keyframe, "slam", ("mapper",), 0, None, _A, _ADVANCED, "data", cache=64,
                       description="keyframe with compressed depth")  # fmt: skip

@@ -7,6 +7,7 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from schemas.fleet import HeldState
+from schemas.fusion import Carrier, FusionState
 from schemas.health import Health
 from schemas.navigation import MissionState
 from schemas.slam import Pose
@@ -22,6 +23,12 @@ _TRAIL_STEP_RAD = math.radians(8.0)
 _BAD_STATES = frozenset({"failed", "released"})
 _GOOD_STATES = frozenset({"docked", "landed"})
 _BATTERY_WARN = 0.30
+_GPS_BAD = frozenset({"distrusted", "silent"})
+CARRIER_WORDS: dict[Carrier, str] = {
+    "camera": "the camera gives the pose", "second": "the second camera carries the pose", "imu": "the IMU carries the pose",
+    "none": "nothing carries the pose",
+}  # fmt: skip
+_CARRIER_LEVEL: dict[Carrier, EventLevel] = {"camera": "good", "second": "warn", "imu": "warn", "none": "bad"}
 
 TrailPoint = tuple[float, float, float, float]
 """x and y in map, metres, the heading, radians, and the height, metres."""
@@ -41,6 +48,7 @@ class Aircraft:
     target: Target | None = None
     vehicle: VehicleState | None = None
     held: HeldState | None = None
+    fusion: FusionState | None = None
     trees: TreeList | None = None
     trees_version: int = 0
     health: dict[str, Health] = field(default_factory=dict)
@@ -96,6 +104,15 @@ class Aircraft:
     def on_held(self, held: HeldState) -> None:
         """Take what the aircraft believes to hold."""
         self.held = held
+
+    def on_fusion(self, fusion: FusionState) -> None:
+        """Take fusion's account of itself and tell of changes of who carries the pose and of the trust in GPS."""
+        before, self.fusion = self.fusion, fusion
+        if before is None or before.carrier != fusion.carrier:
+            self._tell("mission", _CARRIER_LEVEL[fusion.carrier], f"fusion: {CARRIER_WORDS[fusion.carrier]}")
+        if before is not None and before.gps != fusion.gps:
+            word = f": {fusion.gps_word}" if fusion.gps_word else ""
+            self._tell("mission", "warn" if fusion.gps in _GPS_BAD else "info", f"GPS {fusion.gps}{word}")
 
     def on_vehicle(self, vehicle: VehicleState) -> None:
         """Take the vehicle's state and tell of changes of mode, arming, battery and connection."""

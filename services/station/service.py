@@ -27,6 +27,7 @@ from schemas.preview import PreviewImage
 from schemas.sketch import SubmapSketch
 from schemas.topics import (
     FLEET_HELD,
+    FUSION_STATE,
     HEALTH,
     MAP_SKETCH,
     MISSION_STATE,
@@ -65,7 +66,7 @@ _NOT_ABOARD = frozenset({"router", "recorder"})
 _CLOUD_ASKS, _CLOUD_TIMEOUT_S, _CLOUD_AGAIN_S = 12, 5.0, 5.0
 _TOPICS: dict[Topic, Callable[[Aircraft, Any], object]] = {
     SLAM_POSE: Aircraft.on_pose, MISSION_STATE: Aircraft.on_mission, VEHICLE_STATE: Aircraft.on_vehicle,
-    TREES_TARGET: Aircraft.on_target, HEALTH: Aircraft.on_health, FLEET_HELD: Aircraft.on_held,
+    TREES_TARGET: Aircraft.on_target, HEALTH: Aircraft.on_health, FLEET_HELD: Aircraft.on_held, FUSION_STATE: Aircraft.on_fusion,
 }  # fmt: skip
 
 

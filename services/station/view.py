@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from schemas.trees import Tree
-from services.station.aircraft import Aircraft
+from services.station.aircraft import CARRIER_WORDS, Aircraft
 from services.station.operators import OperatorDesk
 
 TREE_FIELDS = (
@@ -40,6 +40,7 @@ def aircraft_view(a: Aircraft, desk: OperatorDesk, now_s: float) -> dict[str, An
         "target": _target(a, now_s),
         "vehicle": _vehicle(a, now_s),
         "claim": _claim(a, now_s),
+        "fusion": _fusion(a, now_s),
         "trees_version": a.trees_version,
         "topics": [
             [name, _r(entry.age_s(now_s), 2), entry.level(now_s), _r(entry.rate_hz(now_s), 1), entry.missed]
@@ -96,6 +97,20 @@ def _claim(a: Aircraft, now_s: float) -> dict[str, Any] | None:
         "kind": None if c.held is None else c.held.kind, "tree": None if c.held is None else c.held.tree_id,
         "left": _r(c.left_s, 0), "asked": None if c.asked is None else c.asked.tree_id, "undelivered": c.undelivered,
         "note": c.note, "age": _r(a.links.age_s("fleet/held", now_s), 2),
+    }  # fmt: skip
+
+
+def _fusion(a: Aircraft, now_s: float) -> dict[str, Any] | None:
+    """Return fusion's state; None where it was never heard, which is where it is off."""
+    f = a.fusion
+    if f is None:
+        return None
+    place = None
+    if f.place is not None:
+        place = [round(f.place.latitude_deg, 7), round(f.place.longitude_deg, 7), _r(f.place.sigma_m, 2)]
+    return {
+        "carrier": f.carrier, "word": CARRIER_WORDS[f.carrier], "carried": _r(f.carried_s, 1), "gps": f.gps, "gps_word": f.gps_word,
+        "place": place, "restarts": f.restarts, "jumps": f.jumps_announced, "age": _r(a.links.age_s("fusion/state", now_s), 2),
     }  # fmt: skip
 
 

@@ -1,7 +1,7 @@
 """An aircraft without a camera: the real mission over a small world, on the real bus.
 
 As a process: ``python -m tests.station.stub_aircraft PORT UAV [SPEED] [SEED]``; with STUB_CAMERA set it has one after all,
-rendered, for the preview alone.
+rendered, for the preview alone; with STUB_FUSION it has fusion.
 """
 
 from __future__ import annotations
@@ -14,12 +14,14 @@ from typing import TYPE_CHECKING, get_args
 import numpy as np
 
 from schemas.command import Command, CommandReply, NonceReply, NonceRequest
+from schemas.fusion import FusionState
 from schemas.health import Health
 from schemas.orders import CommandName
 from schemas.sketch import SubmapSketch
 from schemas.topics import (
     COMMAND,
     COMMAND_NONCE,
+    FUSION_STATE,
     HEALTH,
     MAP_SKETCH,
     MISSION_STATE,
@@ -135,6 +137,8 @@ class StubAircraft:
         if world._target is not None:
             c.publish(TREES_TARGET, world._target.message.model_copy(update={"seq": self._ticks}))
         c.publish(MISSION_STATE, world.outputs.state.model_copy(update={"seq": self._ticks}))
+        if "STUB_FUSION" in os.environ:
+            c.publish(FUSION_STATE, self._fused(world.now_ns))
         if self._camera is not None and self._ticks % 3 == 0 and c.listened(PREVIEW_IMAGE):
             known = tuple(self.known.values())
             target = None if world._target is None else world._target.message
@@ -145,6 +149,14 @@ class StubAircraft:
             self.version += 1
             trees = tuple(self.known[k] for k in sorted(self.known))
             c.publish(TREES_LIST, TreeList(stamp_ns=world.now_ns, map_id=world.map_id, version=self.version, graph_version=0, trees=trees))  # fmt: skip
+
+    def _fused(self, now_ns: int) -> FusionState:
+        """Fusion that carries the pose by IMU for good, and does not believe its GPS."""
+        nothing = (0.0, 0.0, 0.0)
+        return FusionState(
+            stamp_ns=now_ns, seq=self._ticks, map_id=self.world.map_id, carrier="imu", carried_s=0.4, gps="distrusted",
+            gps_word="it jumped by 10.2 m", place=None, accel_bias_m_s2=nothing, gyro_bias_rad_s=nothing, restarts=0, jumps_announced=0,
+        )  # fmt: skip
 
     def _look(self) -> bool:
         """Take in the trees that the camera sees: each look makes the belief better."""

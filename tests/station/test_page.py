@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from tests.station.conftest import Ground, opened_page, until
 
 if TYPE_CHECKING:
+    import pytest
     from playwright.sync_api import Browser, Page
 
 
@@ -30,6 +31,12 @@ def state(page: Page) -> str:
 def toast(page: Page) -> str:
     page.wait_for_selector(".toast", timeout=5_000)
     return page.locator(".toast").last.inner_text()
+
+
+def systems(page: Page) -> str:
+    page.click("#tab-systems")
+    page.wait_for_timeout(400)
+    return page.inner_text("#panel-systems")
 
 
 def log(page: Page) -> str:
@@ -145,8 +152,10 @@ def test_two_operators_one_in_command(ground: Ground, page: Page, browser: Brows
         assert "operator takes command from Anna" in log(page)
 
 
-def test_several_aircraft_side_by_side(ground: Ground, page: Page) -> None:
+def test_several_aircraft_side_by_side(ground: Ground, page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
     for number in (2, 1):  # by name on the page, whoever is heard first
+        if number == 1:
+            monkeypatch.setenv("STUB_FUSION", "yes")
         ground.aircraft(f"uav{number}", seed=number)
         true(page, f"window.treedock.crafts.size === {3 - number}", 60.0)
     true(page, "document.querySelectorAll('.chip').length === 3", 10.0)
@@ -158,6 +167,11 @@ def test_several_aircraft_side_by_side(ground: Ground, page: Page) -> None:
     held(page, "#order-start")
     true(page, "window.treedock.craft?.view?.mission?.state !== 'idle'", 5.0)
     assert page.evaluate("window.treedock.crafts.get('uav1').view.mission.state") == "idle"
+    assert "slam alone gives the pose" in systems(page), "fusion is off on uav2"
+    page.click("#fleet .chip >> nth=1")
+    true(page, "document.getElementById('who-uav').innerText === 'uav1'", 10.0)
+    assert "the IMU carries the pose, 0.4 s without the first camera" in systems(page)
+    assert "it jumped by 10.2 m" in systems(page)
 
 
 def test_the_keyboard_alone_is_enough(ground: Ground, page: Page) -> None:

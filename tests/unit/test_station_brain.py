@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from schemas.command import CommandReply
 from schemas.envelope import DecodeError
+from schemas.fusion import EarthPlace, FusionState
 from schemas.health import Health
 from schemas.navigation import MissionState
 from schemas.slam import Pose
@@ -47,6 +48,15 @@ class FakePages:
 
     def last(self, kind: str, page: int | None = None) -> dict[str, Any]:
         return next(m for p, m in reversed(self.told) if m["t"] == kind and page in (None, p))
+
+
+def fused(**changes: Any) -> FusionState:
+    nothing = (0.0, 0.0, 0.0)
+    values: dict[str, Any] = {
+        "stamp_ns": 1, "seq": 1, "map_id": "m1", "carrier": "camera", "carried_s": 0.0, "gps": "trusted", "gps_word": "",
+        "place": None, "accel_bias_m_s2": nothing, "gyro_bias_rad_s": nothing, "restarts": 0, "jumps_announced": 0,
+    }  # fmt: skip
+    return FusionState(**{**values, **changes})
 
 
 class Desk:
@@ -336,3 +346,27 @@ def test_a_browser_that_takes_nothing_is_cut_off_and_holds_little() -> None:
 
 def test_a_preview_names_its_aircraft() -> None:
     assert frame_of("uav1", b"jpeg") == b"P\x04uav1jpeg"
+
+
+def test_pages_are_told_of_fusion_and_the_log_of_who_carries_the_pose() -> None:
+    desk = Desk()
+    desk.join(1, "Anna")
+    craft = desk.brain.aircraft("uav1")
+    desk.brain.tell_state(desk.now_s)
+    assert desk.pages.last("state")["aircraft"][0]["fusion"] is None, "off: nothing is heard of it"
+    place = EarthPlace(latitude_deg=48.1, longitude_deg=11.5, altitude_m=520.0, heading_rad=0.1, sigma_m=0.42)
+    craft.on_fusion(fused(place=place))
+    craft.on_fusion(fused(seq=2, carrier="imu", carried_s=0.6, gps="distrusted", gps_word="it jumped by 10 m"))
+    desk.brain.tell_state(desk.now_s)
+    told = desk.pages.last("state")["aircraft"][0]["fusion"]
+    assert (told["carrier"], told["carried"], told["gps"], told["gps_word"]) == (
+        "imu",
+        0.6,
+        "distrusted",
+        "it jumped by 10 m",
+    )
+    assert told["place"] is None
+    words = [(e.level, e.text) for e in desk.brain.log.latest()]
+    assert words[-3:] == [
+        ("good", "fusion: the camera gives the pose"), ("warn", "fusion: the IMU carries the pose"), ("warn", "GPS distrusted: it jumped by 10 m"),
+    ]  # fmt: skip

@@ -20,7 +20,7 @@ const VITALS = [
   { id: "mode", name: "Mode", topic: "vehicle/state", of: (v) => (v.vehicle ? [v.vehicle.override ? "pilot" : words(v.vehicle.mode), v.vehicle.override ? "bad" : "", v.vehicle.armed ? "armed" : "disarmed"] : null) },
   { id: "link", name: "Link", topic: null, of: (v, c, now) => [{ good: "good", late: "late", lost: "LOST", none: "none" }[c.link(now)], { good: "good", late: "warn", lost: "bad", none: "" }[c.link(now)], duration(c.linkAge(now))] },
   { id: "height", name: "Height", topic: "slam/pose", of: (v) => (v.pose?.at ? [`${v.pose.at[2].toFixed(1)} m`, "", "over start"] : null) },
-  { id: "pose", name: "Position", topic: "slam/pose", of: (v) => (v.pose ? [words(v.pose.status), v.pose.status === "tracking" ? "" : "bad", v.pose.sigma == null ? "" : `± ${(v.pose.sigma * 100).toFixed(0)} cm`] : null) },
+  { id: "pose", name: "Position", topic: "slam/pose", of: (v) => (v.pose ? [words(v.pose.status), v.pose.status === "tracking" ? "" : "bad", v.pose.status !== "tracking" && v.fusion && v.fusion.carrier !== "none" ? `by ${v.fusion.carrier}` : v.pose.sigma == null ? "" : `± ${(v.pose.sigma * 100).toFixed(0)} cm`] : null) },
   { id: "distance", name: "To target", topic: "mission/state", of: (v) => (v.mission?.distance == null ? ["—", ""] : [`${v.mission.distance.toFixed(2)} m`, "", `tree ${v.mission.target ?? "—"}`]) },
 ];
 
@@ -106,9 +106,21 @@ function fleetRows({ leases, visited, waits }) {
   const rows = [{ key: "g3", group: `Claims of the fleet: ${visited} trees visited${waits ? `, none granted for ${duration(waits)}` : ""}` }];
   for (const { uav, kind, tree, left } of leases) {
     const what = kind === "tree" ? `tree ${tree}` : kind === "way" ? "way home" : "its place";
-    rows.push({ key: `c/${uav}/${what}`, name: uav, level: left < 15 ? "late" : "good", age: null, right: what, note: `${Math.round(left)} s left` });
+    rows.push({ key: `c/${uav}/${what}`, name: uav, level: left < 15 ? "late" : "good", right: what, note: `${Math.round(left)} s left` });
   }
   return rows;
+}
+
+/** By what the pose stands beside the camera, and how the GPS is trusted. */
+function fusionRows(craft, fusion, now) {
+  const group = { key: "g4", group: "Fusion of IMU, GPS, second camera" };
+  if (!fusion) return [group, { key: "f/pose", name: "pose", level: "none", right: "off", note: "slam alone gives the pose" }];
+  const age = craft.age(fusion.age, now), late = age > 3, own = fusion.carrier === "camera";
+  const carried = own ? "" : `, ${fusion.carried.toFixed(1)} s without the first camera`;
+  const rows = [group, { key: "f/pose", name: "pose", level: late || fusion.carrier === "none" ? "lost" : own ? "good" : "late", age, right: own ? "on" : fusion.carrier, note: fusion.word + carried }];
+  if (fusion.gps === "off") return rows;
+  const place = fusion.place ? `${fusion.place[0].toFixed(6)}° ${fusion.place[1].toFixed(6)}° ± ${fusion.place[2].toFixed(1)} m` : "not on the earth yet";
+  return [...rows, { key: "f/gps", name: "GPS", level: late ? "lost" : fusion.gps === "trusted" ? "good" : "late", age, right: fusion.gps, note: fusion.gps_word || place }];
 }
 
 export function drawSystems(craft, now, fleet) {
@@ -129,6 +141,7 @@ export function drawSystems(craft, now, fleet) {
   for (const [name, age, , rate] of view.topics) {
     rows.push({ key: `t/${name}`, name, level: levelOf(craft, name, now), age: craft.age(age, now), right: lost ? "" : `${rate.toFixed(rate < 10 ? 1 : 0)} Hz`, note: "" });
   }
+  rows.push(...fusionRows(craft, view.fusion, now));
   if (fleet) rows.push(...fleetRows(fleet));
   keyed(panel, rows, (r) => r.key, (r) => (r.group ? el("div", { class: "group" }, r.group) : el("div", { class: "sys" }, el("i", { class: "dot" }), el("b"), el("span", { class: "rate" }), el("span", { class: "age" }), el("div", { class: "note" }))), (node, r) => {
     if (r.group) return;
@@ -137,7 +150,7 @@ export function drawSystems(craft, now, fleet) {
     set(dot, "data-level", r.level);
     text(name, r.name);
     text(rate, r.right);
-    text(age, r.key.startsWith("c/") ? "" : r.age === null ? "never" : `${duration(r.age)}${r.level === "late" || r.level === "lost" ? " late" : ""}`);
+    text(age, r.age === undefined ? "" : r.age === null ? "never" : `${duration(r.age)}${r.level === "late" || r.level === "lost" ? " late" : ""}`);
     text(note, r.note);
     set(note, "hidden", r.note ? null : "");
   });
