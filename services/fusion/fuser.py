@@ -7,12 +7,11 @@ W since then, with that motion's joint covariance, and for so long as ``config``
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from schemas.fusion import Carrier
-from services.common.geometry import Matrix, inverse, rotation_z
+from services.common.geometry import Matrix, inverse
+from services.fusion.anchor import Anchor
 from services.fusion.config import FusionConfig
 from services.fusion.gps import GpsDesk
 from services.fusion.guard import Guard
@@ -26,8 +25,6 @@ from services.fusion.values import (
     ImuReading,
     Located,
     Moved,
-    adjoint,
-    carried,
     relative,
 )
 
@@ -39,14 +36,6 @@ _WALK_M_S = 1.0
 _NONE = -1
 _IMU_BEGIN_NS, _IMU_BACK_NS = 50_000_000, 300_000_000
 """An IMU that has told so much without a gap is begun with, or taken in again."""
-
-
-@dataclass(slots=True)
-class _Anchor:
-    """The last state at which the first camera was located."""
-
-    index: int
-    located: Located
 
 
 class Fuser:
@@ -61,7 +50,7 @@ class Fuser:
         self.restarts = self.jumps_announced = 0
         self.resets = 0
         """Added to slam's own reset counter: jumps that slam did not tell."""
-        self._anchor: _Anchor | None = None
+        self._anchor: Anchor | None = None
         self.guard = Guard(config, T_body_camera)
         self._pending: Located | None = None
         """A frame that is to become a state once the IMU has told of its time."""
@@ -163,7 +152,7 @@ class Fuser:
             T_W_body = located.T_map_camera @ inverse(self._T_body_camera)
         tilt = max(0.03, float(np.sqrt(located.covariance.diagonal()[3:5].max())))
         s.begin(located.stamp_ns, T_W_body, tilt, velocity)
-        self.smoother, self._anchor = s, _Anchor(0, located)
+        self.smoother, self._anchor = s, Anchor(0, located)
         self._began_ns = located.stamp_ns
         if self._eye is not None:
             self._eye.begin()
@@ -202,12 +191,12 @@ class Fuser:
         state = s.step(located.stamp_ns, step)
         if step is not None:
             s.join(anchor.index, state.index, step, robust=not same)
-        self._anchor, self._blind = _Anchor(state.index, located), False
+        self._anchor, self._blind = Anchor(state.index, located), False
         if not self._settle(seen=True):
             return self._begin(located, state.T_W_body)
         return self._as_told(located)
 
-    def _step(self, s: Smoother, anchor: _Anchor, located: Located, *, same: bool) -> Moved | None:
+    def _step(self, s: Smoother, anchor: Anchor, located: Located, *, same: bool) -> Moved | None:
         """Return how the body moved since the last located state, as far as the map can tell; None: the IMU alone knows.
 
         A place found again in the same map is one, with doubt. A map that slam has corrected says nothing of the way in
@@ -233,7 +222,7 @@ class Fuser:
             untold = located.epoch == anchor.located.epoch
             self.resets += untold
             self.jumps_announced += untold
-            self._anchor = _Anchor(_NONE, located)  # nothing joins the two places
+            self._anchor = Anchor(_NONE, located)  # nothing joins the two places
         return verdict == "refused"
 
     # -- without the first camera -------------------------------------------------------------------------------
@@ -251,21 +240,10 @@ class Fuser:
         if not self._settle(seen=self._second_sees(state.stamp_ns)):
             return None
         carrier: Carrier = "second" if self._second_sees(state.stamp_ns) else "imu"
-        limit_s = self.config.second_alone_s if carrier == "second" else self.config.imu_alone_s
-        if (state.stamp_ns - anchor.located.stamp_ns) * 1e-9 > limit_s or not s.holds(anchor.index):
+        if not (s.holds(anchor.index) and anchor.reaches(state.stamp_ns, carrier, self.config)):
             return None
-        pose, covariance = self.carried_to(state.index)
-        if float(np.sqrt(covariance.diagonal()[:3].max())) > self.config.sigma_m:
-            return None
-        return Fused(state.stamp_ns, pose, covariance, carrier)
-
-    def carried_to(self, index: int) -> tuple[Matrix, Matrix]:
-        """Return the first camera's pose and covariance in the map at a state after the last located one."""
-        s, anchor = self._window()
-        moved = s.moved(anchor.index, index)
-        A = adjoint(inverse(self._T_body_camera))
-        T = inverse(self._T_body_camera) @ moved.T @ self._T_body_camera
-        return carried(anchor.located, T, A @ moved.covariance @ A.T)
+        moved = s.moved(anchor.index, state.index)
+        return anchor.told(state.stamp_ns, carrier, moved, self._T_body_camera, self.config)
 
     def _second_sees(self, stamp_ns: int) -> bool:
         return self._eye is not None and self._eye.sees(stamp_ns)
@@ -284,7 +262,7 @@ class Fuser:
                     s.place(placement.index, placement.position_W_m, placement.covariance, antenna)
         return self._solve()
 
-    def _window(self) -> tuple[Smoother, _Anchor]:
+    def _window(self) -> tuple[Smoother, Anchor]:
         """Return both, once there are any."""
         assert self.smoother is not None
         assert self._anchor is not None
@@ -313,11 +291,7 @@ class Fuser:
     # -- what else is known -------------------------------------------------------------------------------------
     def on_earth(self) -> tuple[Matrix, Matrix, float] | None:
         """Return the body's place (east, north, up), its attitude on the earth (3, 3), and its horizontal sigma."""
-        if self.gps is None or self.gps.geo.state is None or self.smoother is None:
-            return None
-        T = self.smoother.last.T_W_body
-        R = rotation_z(float(self.gps.geo.state.x[0])) @ T[:3, :3]
-        return self.gps.geo.on_earth(T[:3, 3]), R, self.gps.geo.sigma_m(T[:3, 3])
+        return None if self.gps is None or self.smoother is None else self.gps.on_earth(self.smoother.last.T_W_body)
 
     @property
     def bias(self) -> tuple[Matrix, Matrix]:

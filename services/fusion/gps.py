@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from schemas.fusion import GpsTrust
-from services.common.geometry import Matrix
+from services.common.geometry import Matrix, rotation_z
 from services.fusion.config import FusionConfig
 from services.fusion.geo import GeoFilter, GeoState
 from services.fusion.jury import Jury
@@ -87,6 +87,13 @@ class GpsDesk:
             elif self._may_place(fix):
                 out += self._placed(fix, index, p_W_m, scale)
         return out
+
+    def on_earth(self, T_W_body: Matrix) -> tuple[Matrix, Matrix, float] | None:
+        """Return place (east, north, up), attitude on the earth (3, 3) and horizontal sigma of a body in W, once known."""
+        if self.geo.state is None:
+            return None
+        R = rotation_z(float(self.geo.state.x[0])) @ T_W_body[:3, :3]
+        return self.geo.on_earth(T_W_body[:3, 3]), R, self.geo.sigma_m(T_W_body[:3, 3])
 
     def blind(self, stamp_ns: int) -> None:
         """End the windows where the cameras end: what comes after is another way."""

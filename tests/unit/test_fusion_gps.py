@@ -13,7 +13,7 @@ from services.fusion.config import FusionConfig, GpsConfig
 from services.fusion.fuser import Fuser
 from services.fusion.gps import GpsDesk
 from services.fusion.smoother import State
-from services.fusion.values import GpsReading
+from services.fusion.values import Fused, GpsReading
 from tests.unit.fusion_motion import FRAME_S, T_BODY_CAMERA, located, reading, stamp_ns, true_body
 
 CONFIG = FusionConfig(gps=True)
@@ -121,45 +121,54 @@ def test_silence_is_told_and_what_comes_after_it_is_used() -> None:
     assert walk.trusted[-1]
 
 
-def test_a_lie_told_in_the_dark_does_not_carry_the_pose_away() -> None:
-    """The receiver jumps by 10 m while no camera sees; the IMU carries the pose for three seconds."""
-    carried = []
-    for gps in (False, True):
-        config = CONFIG.model_copy(update={"gps": gps, "imu_alone_s": 3.0, "sigma_m": 5.0, "gps_noise": QUICK})
-        fuser, rng, frames, told = Fuser(config, T_BODY_CAMERA), np.random.default_rng(7), 0, []
-        for k in range(-25, 1060):
+@dataclass(frozen=True)
+class Dark:
+    """A flight whose receiver jumps, and whose camera is lost from ``dark_s`` on."""
+
+    config: FusionConfig
+    jump_s: float
+    dark_s: float
+    until_s: float
+    gps_sigma_m: float
+
+    def flown(self, *, gps: bool) -> tuple[list[Fused | None], Fuser]:
+        """Return what is told of each frame, with or without the receiver."""
+        fuser, rng = Fuser(self.config.model_copy(update={"gps": gps}), T_BODY_CAMERA), np.random.default_rng(7)
+        told: list[Fused | None] = []
+        for k in range(-25, round(self.until_s / 0.008)):
             t_s = k * 0.008
             fuser.imu(reading(t_s, 0.008, rng, bias=0.05))
             if k % 25 == 0:
-                fuser.fix(GpsReading(stamp_ns(t_s), true_body(t_s)[:3, 3] + jump(6.4)(t_s), 0.3))
-            if t_s >= frames * FRAME_S:
-                at_s, frames = frames * FRAME_S, frames + 1
+                fuser.fix(GpsReading(stamp_ns(t_s), true_body(t_s)[:3, 3] + jump(self.jump_s)(t_s), self.gps_sigma_m))
+            if t_s >= (at_s := len(told) * FRAME_S):
                 place = located(at_s, rng)
-                fused = fuser.camera(stamp_ns(at_s), None if at_s > 6.0 else place)
-                told += [fused] if fused is not None and fused.carrier == "imu" else []
-        carried.append(told)
-        assert fuser.gps is None or (fuser.gps.geo.state is not None and fuser.gps.refused >= 2)
-    assert len(carried[0]) == len(carried[1]) > 25
-    apart = [np.linalg.norm((a.T_map_camera - b.T_map_camera)[:3, 3]) for a, b in zip(*carried, strict=True)]
-    assert max(apart) < 0.3
+                told.append(fuser.camera(stamp_ns(at_s), None if at_s > self.dark_s else place))
+        return told, fuser
 
 
-def test_no_gps_moves_a_pose_in_the_map() -> None:
-    """What is told while a camera is located, and the IMU's second after it, is the same with a receiver that lies."""
-    flights = []
-    for config in (FusionConfig(), CONFIG):
-        fuser, rng, frames, told = Fuser(config, T_BODY_CAMERA), np.random.default_rng(7), 0, []
-        for k in range(-25, 1000):
-            t_s = k * 0.008
-            fuser.imu(reading(t_s, 0.008, rng, bias=0.05))
-            if k % 25 == 0:
-                fuser.fix(GpsReading(stamp_ns(t_s), true_body(t_s)[:3, 3] + jump(4.0)(t_s), 1.3))
-            if t_s >= frames * FRAME_S:
-                at_s, frames = frames * FRAME_S, frames + 1
-                place = located(at_s, rng)
-                told.append(fuser.camera(stamp_ns(at_s), None if at_s > 7.2 else place))
-        flights.append(told)
-    assert any(f is not None and f.carrier == "imu" for f in flights[0])
-    for a, b in zip(*flights, strict=True):
+LONG_ALONE = CONFIG.model_copy(update={"imu_alone_s": 3.0, "sigma_m": 5.0, "gps_noise": QUICK})
+
+
+@pytest.mark.parametrize(
+    ("flight", "carried", "apart_m"),
+    [
+        pytest.param(Dark(LONG_ALONE, 6.4, 6.0, 8.48, 0.3), 26, 0.3, id="told in the dark, while the IMU carries for 3 s"),
+        pytest.param(Dark(CONFIG, 4.0, 7.2, 8.0, 1.3), 1, 0.0, id="told in the light, and the IMU's second after it"),
+    ],
+)  # fmt: skip
+def test_a_receiver_that_jumps_by_ten_metres_does_not_carry_the_pose_away(
+    flight: Dark, carried: int, apart_m: float
+) -> None:
+    """While a camera is located, and in the second after it, what is told is the same to the bit."""
+    (without, _), (lied_to, fuser) = flight.flown(gps=False), flight.flown(gps=True)
+    assert sum(f is not None and f.carrier == "imu" for f in without) >= carried
+    for a, b in zip(without, lied_to, strict=True):
         assert (a is None) == (b is None)
-        assert a is None or b is None or np.array_equal(a.T_map_camera, b.T_map_camera)
+        if a is not None and b is not None:
+            most_m = apart_m if a.carrier == "imu" else 0.0
+            assert float(np.linalg.norm((a.T_map_camera - b.T_map_camera)[:3, 3])) <= most_m
+            assert most_m > 0.0 or np.array_equal(a.T_map_camera, b.T_map_camera)
+    if apart_m:
+        assert fuser.gps is not None
+        assert fuser.gps.geo.state is not None
+        assert fuser.gps.refused >= 2
