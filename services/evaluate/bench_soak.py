@@ -26,7 +26,7 @@ from services.evaluate.faults.flown import ENDED
 from services.evaluate.faults.missions import Flights
 from services.evaluate.faults.rig import ONBOARD, Rig
 from services.evaluate.faults.system import flight_config
-from services.evaluate.soak_figures import Sample, faults_of, of_service, steady
+from services.evaluate.soak_figures import Sample, SharedFiles, faults_of, of_service, steady
 
 _MINUTES, _QUICK_MINUTES = 60.0, 3.0
 _EVERY_S = 10.0
@@ -113,6 +113,7 @@ class _Sampler:
         self._rig, self._write = rig, write
         self._begin_s = self._last_s = time.monotonic()
         self._poses, self._sim_ns = rig.flown.poses, rig.flown.now_ns
+        self._shared = SharedFiles()
 
     @property
     def age_s(self) -> float:
@@ -132,9 +133,15 @@ class _Sampler:
         self._write({
             "at_s": round(self.age_s, 1), "sim_s": round(flown.now_ns * 1e-9, 1), "missions": missions, "docks": docks,
             "touches": flown.touches, "pose_hz": round(rate, 2), "rss_mb": sum(s["rss_mb"] for s in services),
-            "shm_files": len(list(Path("/dev/shm").iterdir())), "own_shm_mb": round(sum(s["shm_mb"] for s in services), 1),
+            "shm_files": self._shared.left(map(self._maps, self._rig.services)), "own_shm_mb": round(sum(s["shm_mb"] for s in services), 1),
             "services": services,
         })  # fmt: skip
+
+    def _maps(self, name: str) -> str:
+        try:
+            return Path(f"/proc/{self._rig.pid(name)}/maps").read_text(encoding="utf-8", errors="replace")
+        except (OSError, InputError):
+            return ""
 
     def _sample(self, name: str) -> dict[str, Any] | None:
         try:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -26,6 +27,25 @@ class Sample:
     files: int
     cpu_s: float = 0.0
     """Processor time of the process so far."""
+
+
+SHARED = Path("/dev/shm")
+
+
+class SharedFiles:
+    """The files of shared memory that our processes have had; other programs of the machine have theirs beside them."""
+
+    def __init__(self, folder: Path = SHARED) -> None:
+        self._folder = folder
+        self._ours: set[str] = set()
+
+    def left(self, maps: Iterable[str]) -> int:
+        """Return how many of ours there are, also of processes that are gone; ``maps``: /proc/PID/maps of those that live."""
+        marker = f"{self._folder}/"
+        for text in maps:
+            self._ours |= {line.partition(marker)[2].split()[0] for line in text.splitlines() if marker in line}
+        self._ours &= {path.name for path in self._folder.iterdir()}
+        return len(self._ours)
 
 
 @dataclass(frozen=True, slots=True)

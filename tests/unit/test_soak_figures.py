@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from services.evaluate.soak_figures import Sample, faults_of, of_service, slope, steady
+from services.evaluate.soak_figures import Sample, SharedFiles, faults_of, of_service, slope, steady
 
 
 def samples(mb_per_h: float, files_per_h: float = 0.0, noise_mb: float = 0.3) -> list[Sample]:
@@ -65,3 +66,14 @@ def test_the_spread_of_a_rate() -> None:
     assert steady([15.0] * 60) == 0.0
     assert steady([15.0] * 30 + [7.5] * 30) > 0.3
     assert steady([]) == float("inf")
+
+
+def test_shared_memory_is_ours_by_who_had_it_and_left_until_the_file_is_gone(tmp_path: Path) -> None:
+    for name in ("mine.zenoh", "later.zenoh", "another.zenoh"):
+        (tmp_path / name).touch()
+    line = "7f00-7f01 rw-s 00000000 00:1a 7 {}/{}\n7f02-7f03 r--p 0 08:01 9 /usr/lib/libc.so\n"
+    shared = SharedFiles(tmp_path)
+    assert shared.left([line.format(tmp_path, "mine.zenoh"), ""]) == 1
+    assert shared.left([line.format(tmp_path, "later.zenoh")]) == 2, "whoever had the first is gone, its file is not"
+    (tmp_path / "mine.zenoh").unlink()
+    assert shared.left([]) == 1
