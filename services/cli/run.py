@@ -49,6 +49,13 @@ def run(
     ] = "builtin",
     trees: Annotated[int | None, typer.Option("--trees", help="Trees to dock at.", min=1)] = None,
     handheld: Annotated[bool, typer.Option("--handheld", help="A person carries the camera.")] = False,
+    aircraft: Annotated[
+        int,
+        typer.Option("--aircraft", help="So many in one simulated forest, with one router and station.", min=1, max=4),
+    ] = 1,
+    join: Annotated[
+        bool, typer.Option("--join", help="Router and station run elsewhere (router.host, --port): start neither.")
+    ] = False,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Open no browser.")] = False,
     record: Annotated[Path | None, typer.Option("--record", help="Record everything into this folder (MCAP).")] = None,
     logs: Annotated[Path | None, typer.Option("--logs", help="Keep the services' logs in this folder.")] = None,
@@ -67,11 +74,18 @@ def run(
     tree = with_trees(loaded(config, settings, port, {k: v for k, v in flags.items() if v is not None}).config)
     tree = with_recorder(tree, record, logs)
     expected = expected_frames(tree)
+    if aircraft > 1:
+        from services.cli.run_fleet import FleetRun
+
+        fleet = FleetRun(tree, aircraft, Console(stderr=True), logs, fixed_port=port is not None)
+        return fleet.to_the_end(as_json=as_json, browser=not no_browser)
 
     def configured() -> TreedockConfig:
-        return prepared(with_port(tree, fixed=port is not None), autopilot)
+        return prepared(tree if join else with_port(tree, fixed=port is not None), autopilot)
 
-    return Run(configured, Console(stderr=True), logs, expected, as_json=as_json, browser=not no_browser).to_the_end()
+    return Run(
+        configured, Console(stderr=True), logs, expected, as_json=as_json, browser=not (no_browser or join), join=join
+    ).to_the_end()
 
 
 class _PortTakenError(InputError):
@@ -86,8 +100,9 @@ class Run:
 
     def __init__(
         self, configured: Callable[[], TreedockConfig], console: Console, logs: Path | None, expected: int | None, *,
-        as_json: bool, browser: bool,
+        as_json: bool, browser: bool, join: bool = False,
     ) -> None:  # fmt: skip
+        self._join = join
         self._configured = configured
         """Gives the configuration with the ports that are free at this moment."""
         self._tree = configured()
@@ -138,7 +153,7 @@ class Run:
 
         # a recording does not wait for its consumers as the simulator does
         last = frozenset[str]() if self._tree.camera.source == "sim" else frozenset({"camera"})
-        supervisor = Supervisor(services_for(self._tree), self._spawn, self._tree.supervisor, last)
+        supervisor = Supervisor(services_for(self._tree, join=self._join), self._spawn, self._tree.supervisor, last)
         again = False
         try:
             return self._supervised(supervisor, stop)
@@ -179,7 +194,8 @@ class Run:
             watch = Watch(session, self._tree.uav, lambda h: supervisor.heard(h.service, h.pid, h.state))
             with Status(watch, supervisor, self._console, self._expected) as status:
                 self._console.print(f"treedock: router on {endpoint}, logs in {self._folder}", highlight=False)
-                announce(self._console, self._folder, browser=self._browser)
+                if not self._join:
+                    announce(self._console, self._folder, browser=self._browser)
                 conductor = self._conductor(watch)
                 self._watch_over(supervisor, watch, status.update, stop, conductor)
             values = self._close(watch, supervisor, time.monotonic() - begin_s, conductor)

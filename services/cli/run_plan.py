@@ -101,18 +101,23 @@ def with_port(tree: TreedockConfig, *, fixed: bool) -> TreedockConfig:
     return tree.model_copy(update={"router": tree.router.model_copy(update={"port": free_port(host)})})
 
 
-def services_for(tree: TreedockConfig) -> tuple[str, ...]:
-    """Return the services of a run, in the order in which they start."""
+def services_for(tree: TreedockConfig, *, join: bool = False) -> tuple[str, ...]:
+    """Return the services of a run, in the order in which they start; ``join``: router and station run elsewhere."""
     from services.cli.mission import flies, guides
 
+    chain = _chain(tree, flies=flies(tree), guides=guides(tree))
+    return tuple(name for name in chain if not (join and name in ("router", "station")))
+
+
+def _chain(tree: TreedockConfig, *, flies: bool, guides: bool) -> tuple[str, ...]:
     station = station_services()
     shown = (*station, "preview") if station else ()
-    kept = ("recorder",) if tree.recorder.mcap or flies(tree) or guides(tree) else ()
+    kept = ("recorder",) if tree.recorder.mcap or flies or guides else ()
     second = ("second_camera", "second_slam") if tree.fusion.enabled and tree.fusion.second.enabled else ()
     fused = ("fusion", *second) if tree.fusion.enabled else ()
     chain = ("router", *shown, *kept, "camera", "slam", *fused, "mapper", "detector", "refiner")
-    if flies(tree):
+    if flies:
         return (*chain, "navigator", "autopilot", "simulator")
-    if guides(tree):
+    if guides:
         chain = (*chain, "navigator")
     return (*chain, "simulator") if tree.camera.source == "sim" else chain

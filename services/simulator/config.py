@@ -112,6 +112,8 @@ class SimulatorConfig(BaseModel):
     seed: int = Field(default=1, ge=0)
     trees: int | None = Field(default=None, ge=0, le=12)
     """Suitable trees asked for in a random scene."""
+    start_m: tuple[float, float] = (0.0, 0.0)
+    """Where the aircraft stands in the scene (flight): each of a fleet has a place of its own."""
     rate_hz: float = Field(default=15.0, gt=0.0, le=60.0)
     clock_rate_hz: float = Field(default=100.0, gt=0.0, le=1000.0)
     reduced: bool = False

@@ -56,9 +56,10 @@ Phase = Literal["waiting", "running", "done"]
 
 
 def simulated_px4(scene: Scene, config: SimulatorConfig) -> SimulatedPx4:
-    """Return the simulated aircraft standing at the scene's start."""
-    z = scene.ground.at(0.0, 0.0) + config.px4.airframe.leg_height_m
-    T_world_body = pose(rotation_z(scene.start_yaw_rad), (0.0, 0.0, z))
+    """Return the simulated aircraft standing at its start."""
+    x, y = config.start_m
+    z = float(scene.ground.at(x, y)) + config.px4.airframe.leg_height_m
+    T_world_body = pose(rotation_z(scene.start_yaw_rad), (x, y, z))
     return SimulatedPx4(scene.ground.at, T_world_body, config.px4, config.seed)
 
 

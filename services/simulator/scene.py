@@ -185,8 +185,8 @@ class Scene:
         """Return the suitable trees with a free place in front of them, and none in the line of sight to the start."""
         return tuple(tree for tree in self.suitable_trees if self._has_place(tree) and not self._hidden(tree))
 
-    def _things(self, but: SceneTree) -> list[tuple[float, float, float]]:
-        """Return x, y and radius of all that stands here."""
+    def things(self, but: SceneTree | None = None) -> list[tuple[float, float, float]]:
+        """Return x, y and radius of all that stands here, ``but`` one tree."""
         found = [(t.x_m, t.y_m, t.radius_m) for t in self.trees if t is not but]
         found += [(p.x_m, p.y_m, p.radius_m) for p in self.posts]
         found += [(b.x_m, b.y_m, b.radius_m) for b in self.bushes]
@@ -194,7 +194,7 @@ class Scene:
         return found + [(p.x_m, p.y_m, _PERSON_RADIUS_M) for p in self.people]
 
     def _has_place(self, tree: SceneTree) -> bool:
-        things = self._things(tree)
+        things = self.things(tree)
         for k in range(_AZIMUTHS):
             angle = 2.0 * math.pi * k / _AZIMUTHS
             x, y = tree.x_m + _DOCK_M * math.cos(angle), tree.y_m + _DOCK_M * math.sin(angle)
