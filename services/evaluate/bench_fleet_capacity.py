@@ -29,7 +29,7 @@ from services.evaluate.station_ground import Ground, Page, until
 from services.evaluate.station_load import Load
 
 _RATE_HZ, _TREES, _LIST_EVERY, _SERVICES = 5.0, 100, 5, 9
-_STEPS, _QUICK_STEPS = (5, 10, 20, 30, 60, 120, 240), (2, 4)
+_STEPS, _QUICK_STEPS = (5, 10, 20, 30, 40, 50, 60, 120, 240), (2, 4)
 _MEASURE_S, _QUICK_S = 10.0, 4.0
 _PAGE_HZ, _LATE_SHARE, _CLAIM_S, _LOST_SHARE = 5.0, 0.8, 0.5, 0.001
 _CODE = ("schemas", "services.station", "services.router", "services.common", "services.fleet",
