@@ -132,3 +132,19 @@ def test_a_port_that_was_asked_for_and_is_taken_is_told() -> None:
     assert (
         err == f"treedock: port {port} on 127.0.0.1 is in use: stop what listens there, or choose another with --port\n"
     )
+
+
+def test_two_aircraft_have_one_router_and_station_and_all_end_together(tmp_path: Path) -> None:
+    logs = tmp_path / "logs"
+    process = start("--aircraft", "2", "--seed", "2", "--logs", str(logs), "--set", "simulator.small=true", "--json")
+    folders = [logs / uav for uav in ("uav1", "uav2")]
+    assert until(lambda: all((folder / "camera.log").exists() for folder in folders), timeout_s=120.0)
+    below = psutil.Process(process.pid).children(recursive=True)
+    process.send_signal(signal.SIGINT)
+    code, out, err = ended(process, 60.0)
+    assert code == 130, err
+    assert "Traceback" not in err
+    assert json.loads(out)["aircraft"]["uav2"]["docks"] == []
+    assert (logs / "router.log").exists()
+    assert not any((folder / "router.log").exists() or (folder / "station.log").exists() for folder in folders)
+    assert until(lambda: not any(p.is_running() and p.status() != psutil.STATUS_ZOMBIE for p in below), timeout_s=30.0)
