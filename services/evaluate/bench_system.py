@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from services.evaluate.bench import BenchOptions, BenchReport
 from services.evaluate.frame_ways import Way, compare, table_of
 from services.evaluate.live_set import READY_WITHIN_S, Flight, fly, frames_for, live_config, observed, told
-from services.evaluate.passages import HEAD, figures_of, line_of, stage_lines
+from services.evaluate.passages import HEAD, figures_of, late_line, line_of, stage_lines
 from services.evaluate.processes import Processes
 from services.evaluate.usage import Budget, group_priority, over_budget
 
@@ -40,7 +40,14 @@ BUDGETS: Mapping[str, Budget] = {
 }
 """What each may use. The memory adds up to the aim; processor time does not: the bursts of mapper and detector, which one
 budget has to cover, do not come together."""
-_AIMS = {"latency_ms_p99": 80.0, "cpu_cores": 1.8, "memory_mb": 1600.0, "ready_s": 6.0, "ready_alone_s_max": 3.0}
+_AIMS = {
+    "latency_ms_p99": 80.0,
+    "latency_ms_p99_under_way": 80.0,
+    "cpu_cores": 1.8,
+    "memory_mb": 1600.0,
+    "ready_s": 6.0,
+    "ready_alone_s_max": 3.0,
+}
 
 
 def run(options: BenchOptions) -> BenchReport:
@@ -108,7 +115,8 @@ def _figures(flight: Flight, alone: Mapping[str, float], ways: Sequence[Way]) ->
 def _summary(figures: Mapping[str, float]) -> str:
     lines = ["| | measured | aim |", "|---|---|---|"]
     words = {
-        "latency_ms_p99": "stamp to target, p99 (ms)", "cpu_cores": "processor, whole set (cores)",
+        "latency_ms_p99": "stamp to target, p99 (ms)",
+        "latency_ms_p99_under_way": "the same without the first second (ms)", "cpu_cores": "processor, whole set (cores)",
         "memory_mb": "memory, whole set (MB)", "ready_s": "whole set ready after (s)",
         "ready_alone_s_max": "slowest service alone ready after (s)",
     }  # fmt: skip
@@ -118,7 +126,8 @@ def _summary(figures: Mapping[str, float]) -> str:
 
 def _flown(flight: Flight) -> str:
     found = figures_of(flight.seen)
-    return "\n".join([*HEAD, line_of(RATE_HZ, found), "", *stage_lines(RATE_HZ, flight.seen)])
+    late = late_line(flight.seen, _AIMS["latency_ms_p99"])
+    return "\n".join([*HEAD, line_of(RATE_HZ, found), "", late, "", *stage_lines(RATE_HZ, flight.seen)])
 
 
 def _processes(flight: Flight) -> str:

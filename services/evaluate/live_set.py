@@ -163,8 +163,9 @@ def fly(frames: Sequence[RgbdFrame], rate_hz: float, services: Sequence[str], *,
             names = ("router", *services, *([STAND_IN] if autopilot else []))
             meter = Meter({SENSOR: os.getpid(), **{name: running.pid(name) for name in names}})
             send(bus, frames, rate_hz, running)
-            used = meter.read()
+            meter.stop()
             time.sleep(_DRAIN_S)
+            used = meter.read()
             seen.sent = len(frames)
     return Flight(seen, used, ready_s)
 

@@ -36,19 +36,28 @@ TOLERANCE = 1.2
 
 
 class Meter:
-    """Measures processes from its making on, by name."""
+    """Measures processes from its making until ``stop`` (or ``read``), by name."""
 
     def __init__(self, pids: Mapping[str, int]) -> None:
         self._processes = {name: psutil.Process(pid) for name, pid in pids.items()}
         self._begin_s = time.monotonic()
         self._cpu_s = {name: _cpu_s(process) for name, process in self._processes.items()}
+        self._cores: dict[str, float] | None = None
+
+    def stop(self) -> None:
+        """Take the processor time until now; the memory later: to ask for it holds each process up for some 10 ms."""
+        elapsed_s = time.monotonic() - self._begin_s
+        self._cores = {
+            name: (_cpu_s(process) - self._cpu_s[name]) / elapsed_s for name, process in self._processes.items()
+        }
 
     def read(self) -> dict[str, Usage]:
-        """Return what each used since; its memory now."""
-        elapsed_s = time.monotonic() - self._begin_s
+        """Return what each used; its memory now."""
+        if self._cores is None:
+            self.stop()
+        cores = self._cores or {}
         return {
-            name: Usage((_cpu_s(process) - self._cpu_s[name]) / elapsed_s, process.memory_full_info().pss / _MB)
-            for name, process in self._processes.items()
+            name: Usage(cores[name], process.memory_full_info().pss / _MB) for name, process in self._processes.items()
         }
 
 

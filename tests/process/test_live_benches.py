@@ -14,7 +14,7 @@ from services.common.errors import InputError
 from services.evaluate.bench_system import BUDGETS, ONBOARD, RATE_HZ
 from services.evaluate.frame_ways import measure
 from services.evaluate.live_set import fly, read_frames
-from services.evaluate.passages import Passage, Passages, figures_of, latencies_ms, stages_ms
+from services.evaluate.passages import Passage, Passages, figures_of, late_line, latencies_ms, stages_ms
 from services.evaluate.usage import Budget, Usage, over_budget
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "deploy"))
@@ -44,6 +44,20 @@ def test_stages_add_up_to_the_latency() -> None:
     assert figures["latency_ms_max"] == pytest.approx(93.0)
     assert figures["measured"] == 50
     assert np.sum([np.array(ms) for ms in stages_ms(seen).values()], axis=0) == pytest.approx(latencies_ms(seen))
+
+
+def test_late_frames_are_told_with_their_second_and_the_first_second_apart() -> None:
+    seen = _passages()
+    first = min(seen.by_stamp)
+    seen.by_stamp[first].target_ns = first + 500 * MS
+    del seen.by_stamp[first + 99 * 66 * MS]
+    seen.by_stamp[first + 50 * 66 * MS] = Passage(frame_ns=first, target_ns=first + 50 * 66 * MS + 140 * MS)
+    figures = figures_of(seen)
+    assert figures["latency_ms_max"] == pytest.approx(500.0)
+    assert figures["latency_ms_p99"] > figures["latency_ms_p99_under_way"] > 33.0
+    words = late_line(seen, 80.0)
+    assert "1 in second 0, 1 in second 3." in words
+    assert "waited for it in vain: 1;" in words
 
 
 def test_a_frame_without_answer_is_no_latency_and_no_frames_are_told() -> None:
