@@ -21,16 +21,19 @@ def make_folder(folder: Path, mode: int = 0o755) -> None:
         raise InputError(f"{folder}: {error.strerror}; name a folder that you can write") from error
 
 
-def write_whole(path: Path, body: bytes, mode: int = 0o644) -> None:
+def write_whole(path: Path, body: bytes, mode: int = 0o644, *, lasting: bool = True) -> None:
     """Write ``body`` beside ``path``, flush it to the disk, and put it in its place; never readable beyond ``mode``.
+
+    ``lasting=False`` does not wait for the disk: whole for whoever comes after a process that was killed, not after a power
+    cut.
 
     Raises:
         InputError: the disk refused; ``path`` is then as it was.
     """
-    write_parts(path, (body,), mode)
+    write_parts(path, (body,), mode, lasting=lasting)
 
 
-def write_parts(path: Path, parts: Iterable[bytes], mode: int = 0o644) -> None:
+def write_parts(path: Path, parts: Iterable[bytes], mode: int = 0o644, *, lasting: bool = True) -> None:
     """Do as ``write_whole`` with a content too large to be held at once."""
     fresh = path.with_name(f".{path.name}.new")
     try:
@@ -39,12 +42,19 @@ def write_parts(path: Path, parts: Iterable[bytes], mode: int = 0o644) -> None:
             for part in parts:
                 out.write(part)
             out.flush()
-            os.fsync(out.fileno())
+            if lasting:
+                os.fsync(out.fileno())
         fresh.replace(path)
-        above = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            os.fsync(above)  # the new name itself, not the content alone
-        finally:
-            os.close(above)
+        if lasting:
+            _sync_names(path.parent)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _sync_names(folder: Path) -> None:
+    """Flush a folder: the new name itself, not the content alone."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

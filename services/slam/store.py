@@ -3,6 +3,9 @@
 A record is a magic word, its kind, length and CRC-32, then its body. What is torn or damaged anywhere is passed over:
 reading goes on at the next magic word. The first record is the header; a file without one is no map. The whole map is
 written beside its old one and renamed over it.
+
+Nothing here waits for the disk: a map is taken up again only in the boot in which it was made, and what a process has
+written outlives it without that. Mapping would stand still for it, and tracking waits for mapping.
 """
 
 from __future__ import annotations
@@ -140,11 +143,11 @@ class Store:
         make_folder(self._folder)
         self.end()
         first = record(HEADER, json.dumps({"format": FORMAT, **asdict(header)}).encode())
-        write_whole(self._log, first)
+        write_whole(self._log, first, lasting=False)
         self._size = len(first)
 
     def append(self, kind: bytes, body: bytes) -> None:
-        """Add a record and flush it to the disk; nothing is added beyond the limit.
+        """Add a record; nothing is added beyond the limit.
 
         Raises:
             OSError: the disk refused.
@@ -156,7 +159,6 @@ class Store:
         handle = os.open(self._log, os.O_WRONLY | os.O_APPEND)
         try:
             os.write(handle, data)
-            os.fdatasync(handle)
         finally:
             os.close(handle)
         self._size += len(data)
@@ -173,7 +175,7 @@ class Store:
                 for kind, body in records(data)
                 if kind == HEADER or (kind == KEYFRAME and _NUMBERS.unpack_from(body)[0] in serials)
             )
-            write_parts(self._log, kept)
+            write_parts(self._log, kept, lasting=False)
         self._size = self._log.stat().st_size
 
     def write_map(self, arrays: Arrays) -> None:
@@ -185,7 +187,7 @@ class Store:
         buffer = BytesIO()
         np.savez(buffer, **arrays)  # type: ignore[arg-type]  # the stub takes allow_pickle for one of them
         body = buffer.getvalue()
-        write_whole(self._whole, struct.pack("<I", zlib.crc32(body)) + body)
+        write_whole(self._whole, struct.pack("<I", zlib.crc32(body)) + body, lasting=False)
 
     def mark(self, kind: bytes, now_ns: int) -> None:
         """Add a sign of life (BEAT), or that the map was taken up again (TAKEN), at the machine's clock since boot.

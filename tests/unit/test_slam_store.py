@@ -56,6 +56,24 @@ def test_a_keyframe_comes_back_as_it_was() -> None:
         np.testing.assert_array_equal(after.columns[name], column)
 
 
+def test_nothing_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Mapping would stand still, and tracking waits for it; a map is of use in the boot that made it only."""
+
+    def forbidden(_: int) -> None:
+        raise AssertionError("flushed to the disk")
+
+    for name in ("fsync", "fdatasync"):
+        monkeypatch.setattr(f"os.{name}", forbidden)
+    store = Store(tmp_path, MOST)
+    store.begin(Header("m", "boot", "camera"))
+    for serial in range(3):
+        store.append(KEYFRAME, encode_keyframe(keyframe(serial)))
+    store.write_map({"numbers": np.arange(3)})
+    store.keep_only({1, 2})
+    assert [k.serial for k in store.read().keyframes] == [1, 2]
+    assert store.read_map()["numbers"].tolist() == [0, 1, 2]
+
+
 WHOLE = [
     record(HEADER, b'{"a": 1}'),
     *(record(KEYFRAME, encode_keyframe(keyframe(k))) for k in range(3)),
