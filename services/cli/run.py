@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -18,6 +17,7 @@ import typer
 from services.cli import scratch
 from services.cli.options import AsJson, ConfigFile, Port, Settings, loaded
 from services.cli.run_plan import expected_frames, services_for, with_port, with_recorder, with_state, with_trees
+from services.cli.spawning import last_line, started
 from services.common.errors import InputError
 from services.station.launch import announce, with_station
 
@@ -170,15 +170,7 @@ class Run:
                 scratch.let_go(self._folder, keep=self._keep_logs or supervisor.restarts > 0)
 
     def _spawn(self, name: str) -> subprocess.Popen[bytes]:
-        """Start a service as a process group of its own: Ctrl-C in the terminal reaches it through us alone."""
-        command = [sys.executable, "-m", "services.cli.app", name, "--config", str(self._config_file),
-                   "--parent", str(os.getpid())]  # fmt: skip
-        # the file already holds what variables and flags said
-        environment = {k: v for k, v in os.environ.items() if not k.startswith("TREEDOCK_") or k == "TREEDOCK_DATA"}
-        with (self._folder / f"{name}.log").open("ab") as log:
-            return subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, process_group=0
-            )
+        return started([name, "--parent", str(os.getpid())], self._config_file, self._folder / f"{name}.log")
 
     def _supervised(self, supervisor: Supervisor, stop: StopSignal) -> int:
         from services.cli.status import Status
@@ -250,7 +242,7 @@ class Run:
         if child is None:
             return
         self._keep_logs = True
-        last = _last_line(self._folder / f"{child.name}.log").removeprefix("treedock: ")
+        last = last_line(self._folder / f"{child.name}.log").removeprefix("treedock: ")
         if child.last_fault.endswith("exit code 2"):
             self._keep_logs = False
             raise _PortTakenError(last) if "in use" in last and child.name in _ON_PORTS else InputError(last)
@@ -308,8 +300,3 @@ def _world_lost(supervisor: Supervisor) -> str:
 def _stopped(stop: StopSignal) -> int:
     """Return the exit code of a run that was stopped, as shells write it: 130 after Ctrl-C, 143 after SIGTERM."""
     return 128 + int(stop.received or signal.SIGINT)
-
-
-def _last_line(path: Path) -> str:
-    lines = path.read_text(errors="replace").strip().splitlines() if path.exists() else []
-    return lines[-1] if lines else "it said nothing"

@@ -7,10 +7,10 @@ other along. The aircraft are not drawn: what keeps them apart is their claims.
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,6 +20,7 @@ import typer
 
 from services.cli import scratch
 from services.cli.run_plan import with_port
+from services.cli.spawning import started
 from services.common.errors import InputError
 from services.station.launch import announce, station_services, with_station
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from services.cli.supervisor import Supervisor
     from services.common.config import TreedockConfig
     from services.common.stop import StopSignal
+    from services.inventory.config import StartPoint
 
 _SITE_DEG = (48.1, 11.5)
 """Where the simulated forest is laid on the earth."""
@@ -103,13 +105,13 @@ class FleetRun:
                     return
 
     def _spawn_ground(self, name: str) -> subprocess.Popen[bytes]:
-        return _started([name], self._folder / "ground.json", self._folder / f"{name}.log")
+        return started([name, "--parent", str(os.getpid())], self._folder / "ground.json", self._folder / f"{name}.log")
 
     def _spawn(self, uav: str) -> subprocess.Popen[bytes]:
         logs = self._folder / uav
         logs.mkdir(exist_ok=True)
         command = ["run", "--join", "--json", "--logs", str(logs)]
-        return _started(command, self._folder / f"{uav}.json", logs / "run.log", logs / "summary.json")
+        return started(command, self._folder / f"{uav}.json", logs / "run.log", logs / "summary.json")
 
     def _told(self, rows: Mapping[str, Mapping[str, Any] | None], stop: StopSignal, *, as_json: bool) -> int:
         values = fleet_figures(rows) | {"duration_s": round(time.monotonic() - self._begun_s, 1)}
@@ -131,8 +133,6 @@ def fleet_configs(
     Raises:
         InputError: nothing is simulated, or the scene has no room for so many.
     """
-    from services.inventory.config import StartPoint
-    from services.inventory.geodesy import TangentPlane
     from services.simulator.catalogue import scene_for
     from services.simulator.fleet_places import fleet_places
 
@@ -143,32 +143,43 @@ def fleet_configs(
         wanted = min(_MOST_TREES, max(2, tree.navigator.trees_wanted) * aircraft)
         simulator = simulator.model_copy(update={"trees": wanted})
     scene = scene_for(simulator.scene, simulator.seed, simulator.trees)
-    places = fleet_places(scene, aircraft)
-    plane = TangentPlane(*_SITE_DEG, 0.0)
-    names = [f"uav{k + 1}" for k in range(aircraft)]
-    points = tuple(
-        StartPoint(uav=uav, latitude_deg=latitude, longitude_deg=longitude, heading_deg=90.0 - _degrees(scene.start_yaw_rad),
-                   sigma_m=_SIGMA_M, sigma_heading_deg=_SIGMA_HEADING_DEG)
-        for uav, (x, y) in zip(names, places, strict=True)
-        for latitude, longitude, _ in [plane.to_geodetic(x, y, 0.0)]
-    )  # fmt: skip
-    fleet = tree.station.fleet.model_copy(update={"enabled": True, "book": str(folder / "fleet.json")})
-    inventory = tree.station.inventory.model_copy(update={"start_points": points})
-    station = tree.station.model_copy(update={"fleet": fleet, "inventory": inventory})
-    ground = with_station(tree.model_copy(update={"uav": "ground", "station": station}), folder)
-    claims = tree.navigator.claims.model_copy(update={"enabled": True})
-    navigator = tree.navigator.model_copy(update={"claims": claims})
+    places = {f"uav{k + 1}": place for k, place in enumerate(fleet_places(scene, aircraft))}
+    ground = _ground(tree, start_points(places, scene.start_yaw_rad), folder)
+    navigator = tree.navigator.model_copy(update={"claims": tree.navigator.claims.model_copy(update={"enabled": True})})
     # without a book the arbiter waits for a lease of wall time, and preflight for 60 s of simulated time
     flight = simulator.flight.model_copy(update={"max_speed": 1.0, "limit_s": 2.0 * simulator.flight.limit_s})
     limits = tree.supervisor.model_copy(update={"mission_within_s": aircraft * tree.supervisor.mission_within_s})
+    common = tree.model_copy(update={"router": ground.router, "navigator": navigator, "supervisor": limits})
     crafts = {
-        uav: tree.model_copy(update={
-            "uav": uav, "router": ground.router, "navigator": navigator, "supervisor": limits,
-            "simulator": simulator.model_copy(update={"start_m": place, "flight": flight}),
+        uav: common.model_copy(update={
+            "uav": uav, "simulator": simulator.model_copy(update={"start_m": place, "flight": flight}),
         })
-        for uav, place in zip(names, places, strict=True)
+        for uav, place in places.items()
     }  # fmt: skip
     return ground, crafts
+
+
+def start_points(places: Mapping[str, tuple[float, float]], yaw_rad: float) -> tuple[StartPoint, ...]:
+    """Return where each aircraft's map begins on the earth; ``places`` (east, north) in the scene, metres."""
+    from services.inventory.config import StartPoint
+    from services.inventory.geodesy import TangentPlane
+
+    plane, points = TangentPlane(*_SITE_DEG, 0.0), []
+    for uav, (x, y) in places.items():
+        latitude, longitude, _ = plane.to_geodetic(x, y, 0.0)
+        points.append(
+            StartPoint(uav=uav, latitude_deg=latitude, longitude_deg=longitude, heading_deg=90.0 - math.degrees(yaw_rad),
+                       sigma_m=_SIGMA_M, sigma_heading_deg=_SIGMA_HEADING_DEG)
+        )  # fmt: skip
+    return tuple(points)
+
+
+def _ground(tree: TreedockConfig, points: tuple[StartPoint, ...], folder: Path) -> TreedockConfig:
+    """Return the configuration of router and station, which has the arbiter."""
+    fleet = tree.station.fleet.model_copy(update={"enabled": True, "book": str(folder / "fleet.json")})
+    inventory = tree.station.inventory.model_copy(update={"start_points": points})
+    station = tree.station.model_copy(update={"fleet": fleet, "inventory": inventory})
+    return with_station(tree.model_copy(update={"uav": "ground", "station": station}), folder)
 
 
 def fleet_figures(rows: Mapping[str, Mapping[str, Any] | None]) -> dict[str, Any]:
@@ -202,23 +213,6 @@ def fleet_lines(values: Mapping[str, Any]) -> list[str]:
         )
         lines.append(f"{uav}: {craft['state']}, docked at {docks or 'nothing'}; {craft['reason']}")
     return [*lines, f"{values['trees']} trees, {values['twice']} of them twice, {values['touches']} touches, {values['duration_s']:.0f} s"]  # fmt: skip
-
-
-def _degrees(angle_rad: float) -> float:
-    return angle_rad * 57.29577951308232
-
-
-def _started(arguments: list[str], config: Path, log: Path, out: Path | None = None) -> subprocess.Popen[bytes]:
-    """Start a treedock command that ends with us, in a process group of its own."""
-    service = arguments[0] != "run"
-    command = [sys.executable, "-m", "services.cli.app", *arguments, "--config", str(config)]
-    command += ["--parent", str(os.getpid())] if service else []
-    # the file already holds what variables and flags said
-    environment = {k: v for k, v in os.environ.items() if not k.startswith("TREEDOCK_") or k == "TREEDOCK_DATA"}
-    with log.open("ab") as errors, (out or log).open("ab") as told:
-        return subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=told, stderr=errors, env=environment, process_group=0
-        )
 
 
 def _end(flights: Mapping[str, subprocess.Popen[bytes]]) -> None:
