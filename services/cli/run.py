@@ -56,6 +56,7 @@ def run(
     join: Annotated[
         bool, typer.Option("--join", help="Router and station run elsewhere (router.host, --port): start neither.")
     ] = False,
+    parent: Annotated[int | None, typer.Option("--parent", hidden=True)] = None,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Open no browser.")] = False,
     record: Annotated[Path | None, typer.Option("--record", help="Record everything into this folder (MCAP).")] = None,
     logs: Annotated[Path | None, typer.Option("--logs", help="Keep the services' logs in this folder.")] = None,
@@ -68,16 +69,23 @@ def run(
     from rich.console import Console
 
     from services.cli.mission import prepared
+    from services.cli.service_command import end_with
 
     flags = {"camera.source": source, "simulator.seed": seed, "simulator.scene": scene,
              "navigator.trees_wanted": trees, "navigator.handheld": True if handheld else None}  # fmt: skip
     tree = with_trees(loaded(config, settings, port, {k: v for k, v in flags.items() if v is not None}).config)
     tree = with_recorder(tree, record, logs)
     expected = expected_frames(tree)
+    if parent is not None:
+        end_with(parent)
     if aircraft > 1:
         from services.cli.run_fleet import FleetRun
 
-        fleet = FleetRun(tree, aircraft, Console(stderr=True), logs, fixed_port=port is not None)
+        if join or autopilot != "builtin":
+            raise InputError(
+                "--aircraft: each has the built-in autopilot, and the run its own router: leave --join, --autopilot out"
+            )
+        fleet = FleetRun(tree, aircraft, Console(stderr=True), logs, record, fixed_port=port is not None)
         return fleet.to_the_end(as_json=as_json, browser=not no_browser)
 
     def configured() -> TreedockConfig:

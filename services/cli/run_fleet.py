@@ -20,8 +20,8 @@ import typer
 
 from services.cli import scratch
 from services.cli.run_plan import with_port
-from services.cli.spawning import started
-from services.common.errors import InputError
+from services.cli.spawning import last_line, started
+from services.common.errors import GoalNotReachedError, InputError
 from services.station.launch import announce, station_services, with_station
 
 if TYPE_CHECKING:
@@ -45,10 +45,11 @@ class FleetRun:
     """One flight of a fleet, from the router's start to the summary."""
 
     def __init__(
-        self, tree: TreedockConfig, aircraft: int, console: Console, logs: Path | None, *, fixed_port: bool
-    ) -> None:
+        self, tree: TreedockConfig, aircraft: int, console: Console, logs: Path | None, record: Path | None, *,
+        fixed_port: bool,
+    ) -> None:  # fmt: skip
         self._console, self._keep, self._begun_s = console, logs is not None, time.monotonic()
-        self._folder = logs or scratch.made()
+        self._folder, self._record = logs or scratch.made(), record
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -58,7 +59,11 @@ class FleetRun:
             (self._folder / f"{name}.json").write_text(config.model_dump_json(indent=1))
 
     def to_the_end(self, *, as_json: bool, browser: bool) -> int:
-        """Fly until all are down or the user stops it; print the summary and return the exit code."""
+        """Fly until all are down or the user stops it; print the summary and return the exit code.
+
+        Raises:
+            InputError: router or station refused the configuration; GoalNotReachedError: they could not be kept alive.
+        """
         from services.cli.supervisor import Supervisor
         from services.common.logging import set_up
         from services.common.stop import StopSignal
@@ -70,7 +75,8 @@ class FleetRun:
         flights: dict[str, subprocess.Popen[bytes]] = {}
         try:
             self._fly(supervisor, flights, stop, browser=browser)
-            rows = {uav: _summary(self._folder / uav / "summary.json") for uav in self._crafts}
+            _end(flights)
+            rows = {uav: _summary(self._folder / uav) for uav in self._crafts}
         finally:
             _end(flights)
             supervisor.stop_all()
@@ -89,20 +95,33 @@ class FleetRun:
 
         def given_up() -> bool:
             supervisor.check()
-            return stop.is_set or supervisor.given_up is not None
+            self._raise_if_given_up(supervisor)
+            return stop.is_set
 
         endpoint = self._ground.router.endpoint
         with opened_client(endpoint, given_up, wait_s=self._ground.supervisor.start_within_s) as session:
             watch = Watch(session, self._ground.uav, lambda h: supervisor.heard(h.service, h.pid, h.state))
             self._console.print(f"treedock: router on {endpoint}, logs in {self._folder}", highlight=False)
             announce(self._console, self._folder, browser=browser)
-            while not stop.is_set and supervisor.given_up is None:
+            while not stop.is_set:
                 watch.pump(_LOOK_S)
                 supervisor.check()
+                self._raise_if_given_up(supervisor)
                 if not flights and supervisor.all_ready:
                     flights |= {uav: self._spawn(uav) for uav in self._crafts}
                 if flights and all(flight.poll() is not None for flight in flights.values()):
                     return
+
+    def _raise_if_given_up(self, supervisor: Supervisor) -> None:
+        child = supervisor.given_up
+        if child is None:
+            return
+        last = last_line(self._folder / f"{child.name}.log").removeprefix("treedock: ")
+        if child.last_fault.endswith("exit code 2"):
+            raise InputError(last)
+        raise GoalNotReachedError(
+            f"{child.name} {child.last_fault} {child.deaths_in_a_row} times before it was ready: {last}"
+        )
 
     def _spawn_ground(self, name: str) -> subprocess.Popen[bytes]:
         return started([name, "--parent", str(os.getpid())], self._folder / "ground.json", self._folder / f"{name}.log")
@@ -110,10 +129,11 @@ class FleetRun:
     def _spawn(self, uav: str) -> subprocess.Popen[bytes]:
         logs = self._folder / uav
         logs.mkdir(exist_ok=True)
-        command = ["run", "--join", "--json", "--logs", str(logs)]
+        command = ["run", "--join", "--json", "--logs", str(logs), "--parent", str(os.getpid())]
+        command += [] if self._record is None else ["--record", str(self._record / uav)]
         return started(command, self._folder / f"{uav}.json", logs / "run.log", logs / "summary.json")
 
-    def _told(self, rows: Mapping[str, Mapping[str, Any] | None], stop: StopSignal, *, as_json: bool) -> int:
+    def _told(self, rows: Mapping[str, Mapping[str, Any]], stop: StopSignal, *, as_json: bool) -> int:
         values = fleet_figures(rows) | {"duration_s": round(time.monotonic() - self._begun_s, 1)}
         if as_json:
             typer.echo(json.dumps(values))
@@ -182,12 +202,12 @@ def _ground(tree: TreedockConfig, points: tuple[StartPoint, ...], folder: Path) 
     return with_station(tree.model_copy(update={"uav": "ground", "station": station}), folder)
 
 
-def fleet_figures(rows: Mapping[str, Mapping[str, Any] | None]) -> dict[str, Any]:
+def fleet_figures(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Return what became of a fleet by each aircraft's own summary, judged by the truth.
 
     ``reached``: every aircraft docked at least once and landed, each docking well, no trunk twice, nothing touched.
     """
-    missions = {uav: (row or {}).get("mission", {}) for uav, row in rows.items()}
+    missions = {uav: row.get("mission", {}) for uav, row in rows.items()}
     docks = [(uav, dock) for uav, mission in missions.items() for dock in mission.get("docks", [])]
     trunks = [dock["true_tree"] for _, dock in docks if dock.get("true_tree") is not None]
     touches = sum(int(mission.get("touches", 0)) for mission in missions.values())
@@ -228,10 +248,12 @@ def _end(flights: Mapping[str, subprocess.Popen[bytes]]) -> None:
             flight.wait()
 
 
-def _summary(path: Path) -> dict[str, Any] | None:
-    """Return an aircraft's summary, None where it gave none."""
+def _summary(folder: Path) -> dict[str, Any]:
+    """Return an aircraft's summary; where it gave none, what its run said last."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8").strip().splitlines()[-1])
+        found = json.loads((folder / "summary.json").read_text(encoding="utf-8").strip().splitlines()[-1])
     except (OSError, ValueError, IndexError):
-        return None
-    return found if isinstance(found, dict) else None
+        found = None
+    if isinstance(found, dict):
+        return found
+    return {"mission": {"reason": last_line(folder / "run.log").removeprefix("treedock: ")}}

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from schemas.fleet import ClaimGoal
-from services.cli.run_fleet import fleet_configs, fleet_figures, fleet_lines
+from services.cli.app import invoke
+from services.cli.run_fleet import _summary, fleet_configs, fleet_figures, fleet_lines
 from services.cli.run_plan import services_for
 from services.common.config import TreedockConfig
 from services.common.errors import InputError
@@ -91,7 +92,7 @@ def _mission(*trunks: int, state: str = "landed", touches: int = 0) -> dict[str,
         ({"uav1": _mission(0), "uav2": _mission()}, False),
         ({"uav1": _mission(0), "uav2": _mission(1, touches=1)}, False),
         ({"uav1": _mission(0), "uav2": _mission(1, state="hold")}, False),
-        ({"uav1": _mission(0), "uav2": None}, False),
+        ({"uav1": _mission(0), "uav2": {"mission": {"reason": "no scene"}}}, False),
     ],
     ids=["good", "one trunk twice", "one without a tree", "a touch", "not down", "no summary"],
 )
@@ -101,3 +102,16 @@ def test_a_fleet_is_judged_by_the_truth(rows: dict[str, Any], reached: bool) -> 
     lines = fleet_lines(values | {"duration_s": 10.0})
     assert len(lines) == 3
     assert lines[0].startswith("uav1: landed, docked at tree 10 at 0.950 m")
+
+
+def test_what_an_aircraft_said_last_stands_for_a_summary_it_did_not_give(tmp_path: Path) -> None:
+    (tmp_path / "run.log").write_text("treedock: ready\ntreedock: no scene 'nowhere'\n")
+    assert _summary(tmp_path)["mission"]["reason"] == "no scene 'nowhere'"
+    (tmp_path / "summary.json").write_text('{"mission": {"state": "landed"}}\n')
+    assert _summary(tmp_path)["mission"]["state"] == "landed"
+
+
+@pytest.mark.parametrize("flags", [["--join"], ["--autopilot", "udpin:0.0.0.0:14540"]])
+def test_a_fleet_brings_its_own_router_and_autopilots(flags: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert invoke(["run", "--aircraft", "2", *flags]) == 2
+    assert "leave --join, --autopilot out" in capsys.readouterr().err
