@@ -21,6 +21,8 @@ _EXIT_INPUT = 2
 _ROUTER = "router"
 _ROUTER_SILENT_S = 3.0
 """All health comes by way of the router: when its own stays away, that of the others says nothing."""
+_OWN_PAUSE_S = 1.0
+"""After a longer pause between two looks the silence of the others is our own: this machine slept, or had no time for us."""
 EXPENDABLE = frozenset({"recorder", "preview", "station"})
 """No flight needs them: once all was well they are tried again for ever."""
 
@@ -85,6 +87,7 @@ class Supervisor:
 
     def __post_init__(self) -> None:
         self.children = {name: Child(name) for name in self.names}
+        self._looked_s = self.now_s()
 
     def heard(self, name: str, pid: int, state: str) -> None:
         """Take note of a health message."""
@@ -110,6 +113,10 @@ class Supervisor:
 
     def check(self) -> None:
         """Start what is due, notice the dead, kill the hung. Called several times a second."""
+        paused_s, self._looked_s = self.now_s() - self._looked_s, self.now_s()
+        if paused_s > _OWN_PAUSE_S:  # a pause of ours is nobody's silence
+            for child in self.children.values():
+                child.heard_s = min(child.heard_s + paused_s, self.now_s())
         for child in self.children.values():
             if child.process is None:
                 if self.now_s() >= child.start_at_s and not self._held_back(child):

@@ -13,6 +13,9 @@ from services.cli.supervisor import Supervisor
 LIMITS = SupervisorConfig(hung_after_s=5.0, start_within_s=60.0, backoff_s=0.5, backoff_max_s=3.0, give_up_after=4)
 
 
+_LOOK_S = 0.5
+
+
 @dataclass
 class FakeProcess:
     pid: int
@@ -49,7 +52,11 @@ class Bench:
         return self.spawned[-1]
 
     def after(self, seconds: float) -> None:
-        self.now_s += seconds
+        end_s = self.now_s + seconds
+        while self.now_s < end_s - _LOOK_S:
+            self.now_s += _LOOK_S
+            self.supervisor.check()
+        self.now_s = end_s
         self.supervisor.check()
 
     def ready(self, name: str) -> None:
@@ -150,7 +157,7 @@ def test_the_source_begins_when_all_others_are_ready_but_comes_back_at_once() ->
     bench.spawned[1].code = 1
     bench.spawned[2].code = 1
     bench.after(0.1)
-    bench.after(5.0)
+    bench.after(2.0)
     assert sorted(bench.order[3:]) == ["camera", "slam"]
 
 
@@ -223,3 +230,17 @@ def test_a_process_that_takes_long_to_die_is_killed_once() -> None:
     bench.after(0.1)
     bench.after(0.6)
     assert len(bench.spawned) == 2
+
+
+def test_who_slept_takes_nobody_for_hung() -> None:
+    """A machine that was suspended, or so busy that the supervisor itself stood still, kills nobody for it."""
+    bench = Bench("slam")
+    bench.after(0.0)
+    bench.ready("slam")
+    bench.after(3.0)
+    bench.now_s += 60.0
+    bench.supervisor.check()
+    bench.after(1.5)
+    assert not bench.spawned[0].signals
+    bench.after(1.0)
+    assert bench.spawned[0].signals == [signal.SIGKILL], "its own silence counts on"
