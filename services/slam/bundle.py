@@ -74,6 +74,22 @@ def chi_squares(problem: Problem, camera: F64) -> F64:
 
 
 @njit(cache=True, nogil=True)
+def disparity_residuals(problem: Problem, camera: F64, least_info: float) -> F64:
+    """Return observed minus predicted disparity of the observations in use whose inverse variance is ``least_info`` or more."""
+    out = np.empty(len(problem.pose))
+    c, count = np.empty(3), 0
+    for m in range(len(problem.X)):
+        for o in range(problem.start[m], problem.start[m + 1]):
+            if problem.use[o] and problem.info[o, 1] >= least_info:
+                k = problem.pose[o]
+                camera_point(problem.R[k], problem.t[k], problem.X[m], c)
+                if c[2] >= MIN_Z_M:
+                    out[count] = problem.obs[o, 2] - camera[4] / c[2]
+                    count += 1
+    return out[:count].copy()
+
+
+@njit(cache=True, nogil=True)
 def total_cost(problem: Problem, camera: F64, robust: bool) -> float:
     """Return the sum of (robust) costs of the observations in use."""
     chi2 = chi_squares(problem, camera)

@@ -25,9 +25,10 @@ class SlamConfig(BaseModel):
     min_depth_m: float = Field(default=0.3, gt=0)
     max_depth_m: float = Field(default=8.0, gt=0)
     """Depth beyond this makes no map point: the sensor's range."""
-    far_m: float = Field(default=12.0, gt=0)
-    """Distance at which a feature is begun that has no depth and none around it: beyond the sensor's range."""
-    far_sigma_inverse_m: float = Field(default=0.5, gt=0)
+    far_m: float = Field(default=16.0, gt=0)
+    """Distance at which a feature is begun that has no depth and none around it: beyond the sensor's range. Its inverse is then
+    anywhere between none and one over 8 m: this is the middle, and the next its standard deviation."""
+    far_sigma_inverse_m: float = Field(default=0.02, gt=0)
     """Standard deviation of the inverse of that distance, 1/m. Both are learned anew once parallax has told enough distances."""
     baseline_m: float = Field(default=0.08, gt=0)
     """Virtual stereo baseline: depth enters as the disparity ``fx * baseline / z``, whose noise is constant."""

@@ -150,6 +150,14 @@ def stretch(image: U8) -> U8 | None:
     return np.clip(128.0 + gain * (soft - mean), 0.0, 255.0).astype(np.uint8)
 
 
+def _ratio(image: U8, small: U8) -> F64:
+    """Return (2,) how many pixels of an image, across and down, make one of a level, about its corner half a pixel out.
+
+    Levels have whole pixels: the ratio is not quite the nominal one, which would be up to 2 px off at the image's far edges.
+    """
+    return np.array([image.shape[1] / small.shape[1], image.shape[0] / small.shape[0]])
+
+
 class Detector:
     """Finds corners level by level; each level's FAST threshold follows the texture from image to image."""
 
@@ -199,8 +207,7 @@ class Detector:
             chosen = xy[spread(xy, strength, quota[level], small.shape[1], small.shape[0])]
             exact = np.empty((len(chosen), 2))
             place(small, chosen, exact)
-            # pixel centres: scaling happens about the image's corner, half a pixel before the first centre
-            places.append((exact + 0.5) * self._scales[level] - 0.5)
+            places.append((exact + 0.5) * _ratio(image, small) - 0.5)
             whole.append(chosen * self._scales[level])
             angles.append(orient(small, chosen))
             octaves.append(np.full(len(chosen), level, np.int32))

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from schemas.camera import Intrinsics
 from services.slam.config import SlamConfig
+from services.slam.depth_noise import DepthNoise
 from services.slam.detect import EDGE_PX, Detector
+from services.slam.sharpness import Sharpness
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
@@ -26,6 +28,8 @@ CELL_PX = 20.0
 DEPTH_REACH = 10.0
 """Depth is read up to so many times the range in which it makes map points."""
 _AROUND_PX = 3
+_ALIKE = 0.1
+"""Share of its depth by which a pixel may differ from one beside it on the same surface."""
 _VOID_PX = 16
 
 
@@ -65,6 +69,8 @@ class Features:
     roll: Roll | None = None
     moving_s: F64 = field(default_factory=lambda: np.zeros(0))
     """(N,) for how long it is not to be trusted, because it was seen to move by itself; 0 for most."""
+    smeared: bool = False
+    """The camera moved while this image was exposed: its corners lie where the smear put them."""
 
     def __post_init__(self) -> None:
         if len(self.moving_s) != len(self.uv):
@@ -81,29 +87,41 @@ def sample_depth(
     """Return depth (N,) at pixels, 0 = none, the inverse variance (N,) of ``bf / depth``, and which are far (N,).
 
     To the sensor's ``sigma`` comes half the range of disparities around the pixel: beside an edge, on a steep surface or
-    where colour and depth were not taken at the same instant nobody knows which of them the feature has.
+    where colour and depth were not taken at the same instant nobody knows which of them the feature has. A pixel that no
+    neighbour is like is the sensor's error: it counts for none.
     """
     height, width = depth_m.shape
     out, info, far = np.zeros(len(xy)), np.zeros(len(xy)), np.zeros(len(xy), np.bool_)
     for i in range(len(xy)):
         c, r = int(xy[i, 0] + 0.5), int(xy[i, 1] + 0.5)
-        if c < _AROUND_PX or r < _AROUND_PX or c >= width - _AROUND_PX or r >= height - _AROUND_PX:
+        if c <= _AROUND_PX or r <= _AROUND_PX or c >= width - _AROUND_PX - 1 or r >= height - _AROUND_PX - 1:
             continue
         z = depth_m[r, c]
         if z <= 0.0:
             far[i] = is_void(depth_m, c, r)
-        if z < low_m or z > high_m:
+        if z < low_m or z > high_m or alone(depth_m, c, r):
             continue
         nearest = farthest = z
         for y in range(r - _AROUND_PX, r + _AROUND_PX + 1):
             for x in range(c - _AROUND_PX, c + _AROUND_PX + 1):
                 other = depth_m[y, x]
-                if other > 0.0:
+                if other > 0.0 and (abs(other - z) < _ALIKE * z or not alone(depth_m, x, y)):
                     nearest, farthest = min(nearest, other), max(farthest, other)
         half = 0.5 * (bf / nearest - bf / farthest)
         out[i] = z
         info[i] = 1.0 / (sigma * sigma + half * half)
     return out, info, far
+
+
+@njit(cache=True, nogil=True)
+def alone(depth_m: NDArray[np.float32], c: int, r: int) -> bool:
+    """Return whether fewer than two of the eight pixels around an inner pixel have a depth like its own."""
+    z = depth_m[r, c]
+    alike = 0
+    for y in range(r - 1, r + 2):
+        for x in range(c - 1, c + 2):
+            alike += abs(depth_m[y, x] - z) < _ALIKE * z
+    return alike < 3
 
 
 @njit(cache=True, nogil=True)
@@ -152,6 +170,7 @@ class Extractor:
         self._intrinsics = intrinsics
         self._config = config
         self._bf = intrinsics.fx * config.baseline_m
+        self.depth_noise = DepthNoise(config.disparity_sigma_px)
         make_orb: Any = cv2.ORB_create  # type: ignore[attr-defined]  # missing from the stubs
         self._orb: Any = make_orb(
             nfeatures=config.features, scaleFactor=config.scale, nlevels=config.levels, edgeThreshold=EDGE_PX - 1
@@ -169,17 +188,19 @@ class Extractor:
         self._K = np.array([[intrinsics.fx, 0.0, intrinsics.cx], [0.0, intrinsics.fy, intrinsics.cy], [0.0, 0.0, 1.0]])
         self._distortion = np.array([intrinsics.k1, intrinsics.k2, intrinsics.p1, intrinsics.p2, intrinsics.k3])
         self._cols, self._rows = grid_size(intrinsics)
+        self._sharpness = Sharpness()
 
     def extract(self, grey: U8, depth_m: NDArray[np.float32]) -> Features:
         """Return the features of an image (H, W) with its depth (H, W)."""
+        smeared, grey = self._sharpness.judge(grey)
         searched, (xy, whole, angle, octave) = self._detector.detect(grey, depth_m)
         desc, kept = self._describe(searched, whole, angle, octave)
         xy, angle, octave = xy[kept], angle[kept], octave[kept]
         depth, info, far = sample_depth(
-            depth_m, xy, self._config.min_depth_m, DEPTH_REACH * self._config.max_depth_m, self._bf,
-            self._config.disparity_sigma_px,
+            depth_m, xy, self._config.min_depth_m, DEPTH_REACH * self._config.max_depth_m, self._bf, self.depth_noise.sigma_px
         )  # fmt: skip
         features = self._build(self.undistort(xy), octave, angle, desc, depth, info, far)
+        features.smeared = smeared
         features.roll = Roll(features.uv, xy[:, 1] / self._intrinsics.height - 0.5, np.zeros_like(xy))
         return features
 

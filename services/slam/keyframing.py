@@ -38,6 +38,8 @@ class KeyframeRule:
         if self._flown:
             return self._due(stamp_ns) or frame.inliers < _HARDLY * self._config.min_inliers
         config, f = self._config, frame.features
+        if f.smeared:  # what it adds would lie wrong, and stay
+            return False
         close = (f.depth >= config.min_depth_m) & (f.depth <= config.max_depth_m) & (f.moving_s == 0.0)
         tracked = int(np.count_nonzero(close & (frame.point >= 0)))
         untracked = int(np.count_nonzero(close & (frame.point < 0)))

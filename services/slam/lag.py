@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from schemas.camera import Intrinsics
 from services.slam.camera import CameraModel, distortion_of
 from services.slam.config import SlamConfig
+from services.slam.depth_noise import DepthNoise
 from services.slam.features import DEPTH_REACH, Features, sample_depth
 from services.slam.links import Keyframes
 from services.slam.motion import Velocity
@@ -26,10 +27,11 @@ F64 = NDArray[np.float64]
 class Lag:
     """Holds the depth image of the frame at hand and gives its features their depth anew as their motion gets known."""
 
-    def __init__(self, intrinsics: Intrinsics, camera: CameraModel, config: SlamConfig) -> None:
+    def __init__(self, intrinsics: Intrinsics, camera: CameraModel, config: SlamConfig, noise: DepthNoise) -> None:
         self._camera = camera.array
         self._distortion = distortion_of(intrinsics)
         self._config = config
+        self._noise = noise
         self._depth_m: F32 = np.zeros((0, 0), np.float32)
         self._after_s = 0.0
         self._kept: tuple[F32, float] | None = None
@@ -69,7 +71,7 @@ class Lag:
         shift = slopes(roll.read, back_s, features.depth, self._camera, velocity.v_m_s, velocity.w_rad_s)
         place = taken_at(roll.read + shift, self._camera, self._distortion)
         depth, features.info, features.far = sample_depth(
-            depth_m, place, config.min_depth_m, DEPTH_REACH * config.max_depth_m, bf, config.disparity_sigma_px
+            depth_m, place, config.min_depth_m, DEPTH_REACH * config.max_depth_m, bf, self._noise.sigma_px
         )
         before_s = after_s + readout_s * roll.row
         features.depth = carried_back(features.uv, depth, before_s, self._camera, velocity.v_m_s, velocity.w_rad_s)

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from schemas.slam import GraphReason
 from services.common.geometry import inverse, orthonormal, pose
 from services.slam.atlas import Atlas, neighbours
-from services.slam.bundle import Problem, adjust, adjust_large, build, chi_squares
+from services.slam.bundle import Problem, adjust, adjust_large, build, chi_squares, disparity_residuals
 from services.slam.camera import CameraModel
 from services.slam.config import SlamConfig
+from services.slam.depth_noise import DepthNoise
 from services.slam.far import FarPrior
 from services.slam.features import Features
 from services.slam.links import create_points, points_of, remove_keyframe, shared_counts
@@ -50,11 +51,13 @@ class Part:
 class Mapping:
     """Keeps the map consistent and small; not aware of frames between keyframes."""
 
-    def __init__(self, atlas: Atlas, camera: CameraModel, config: SlamConfig, crew: Crew) -> None:
+    def __init__(self, atlas: Atlas, camera: CameraModel, config: SlamConfig, crew: Crew, noise: DepthNoise
+    ) -> None:  # fmt: skip
         self.atlas = atlas
         self.camera = camera
         self.config = config
         self.far = FarPrior(config.far_m, config.far_sigma_inverse_m)
+        self.depth_noise = noise
         self.step = crew.step
         self._crew = crew
         self.revision = 0
@@ -218,6 +221,7 @@ class Mapping:
                     break
             gate(chi_squares(problem, camera), problem.info, 1.0, problem.use)
         with self.step():
+            self.depth_noise.learn(disparity_residuals(problem, camera, self.depth_noise.least_info))
             self._apply(part)
             self.why = why
 

@@ -64,7 +64,7 @@ class Slam:
         self._extractor = Extractor(intrinsics, config)
         cells = camera.cols * int(np.ceil(intrinsics.height / 20.0))
         self.atlas = Atlas(config.features, cells, config.scale, config.levels)
-        self.mapping = Mapping(self.atlas, camera, config, self.crew)
+        self.mapping = Mapping(self.atlas, camera, config, self.crew, self._extractor.depth_noise)
         self.tracking = Tracking(self.atlas, camera, config, self.mapping.far)
         self.loops = Loops(self.mapping, self.tracking, Places(vocabulary.load()), config)
         self.reset_counter = 0
@@ -75,7 +75,7 @@ class Slam:
         self._last: Tracked | None = None
         self._motion = Motion()
         self.shutter = Shutter(self.atlas, camera)
-        self._lag = Lag(intrinsics, camera, config)
+        self._lag = Lag(intrinsics, camera, config, self._extractor.depth_noise)
         self._verifier = Verifier(intrinsics, camera)
         self._found: tuple[int, Tracked] | None = None
         """Stamp and frame of a place found blind that waits for a second frame to say the same."""
@@ -178,7 +178,7 @@ class Slam:
             return None
         velocity = self._motion.velocity(stamp_ns, _step(last, frame))
         self._place(features, velocity)
-        joined = self.tracking.join_map(frame)
+        joined = self.tracking.join_map(frame, unsure=last.features.smeared)
         if joined is None or joined[0].inliers < self.config.min_inliers:
             return None
         if self.shutter.learn(joined[0]):

@@ -29,6 +29,9 @@ MATCH_BLIND = 60
 """Where it is not."""
 _WINDOW_LAST_PX = 15.0
 _WINDOW_MAP_PX = 5.0
+_WINDOW_UNSURE_PX = 15.0
+_SMEAR_VARIANCE = 9.0
+"""Times the usual variance of u and v in a smeared image."""
 _PROVEN, _PROVEN_LEAST = 5, 40
 """Frames in which a point has been found, from which on it is proven; and so many such points place a frame."""
 _ENOUGH = 20
@@ -87,7 +90,7 @@ class Tracking:
         world = (local - last.t) @ last.R
         has = known >= 0
         world[has] = self.atlas.points.pos[known[has]]
-        return world, known, has | (z > 0.0)
+        return world, known, has | ((z > 0.0) & (not f.smeared))
 
     def by_proven(self, frame: Tracked) -> Tracked | None:
         """Return the frame as only points place it that were found in several frames before; None where they are too few."""
@@ -165,7 +168,8 @@ class Tracking:
         cam = self.camera
         disparity = features.disparity[index]
         obs = np.column_stack([features.uv[index], disparity])
-        info = np.column_stack([1.0 / (cam.variance[features.octave[index]] + doubt), features.info[index]])
+        variance = cam.variance[features.octave[index]] * (_SMEAR_VARIANCE if features.smeared else 1.0)
+        info = np.column_stack([1.0 / (variance + doubt), features.info[index]])
         use, H = np.ones(len(index), np.bool_), np.zeros((6, 6))
         if len(index) < 6:
             return 0, use, H, 0.0
@@ -219,13 +223,19 @@ class Tracking:
         frame.inliers = count
         frame.point[index[~use]] = -1
 
-    def join_map(self, frame: Tracked) -> tuple[Tracked, int] | None:
-        """Match the frame with the local map and refine; returns it and its best keyframe slot, None when that fails."""
+    def join_map(self, frame: Tracked, *, unsure: bool = False) -> tuple[Tracked, int] | None:
+        """Match the frame with the local map and refine; returns it and its best keyframe slot, None when that fails.
+
+        ``unsure``: the pose it was found at may be some centimetres off, so the map is first searched in wider windows.
+        """
         atlas = self.atlas
         counts = shared_counts(atlas.points, frame.point, len(atlas.keyframes.n))
         if not counts.any():
             return None
-        located = self.join_keyframes(frame, self._local_keyframes(counts), _WINDOW_MAP_PX, tally=True)
+        around = self._local_keyframes(counts)
+        if unsure:
+            frame = self.join_keyframes(frame, around, _WINDOW_UNSURE_PX) or frame
+        located = self.join_keyframes(frame, around, _WINDOW_MAP_PX, tally=True)
         if located is None:
             return None
         counts = shared_counts(atlas.points, located.point, len(atlas.keyframes.n))

@@ -9,6 +9,7 @@ from services.common.geometry import inverse
 from services.slam.camera import camera_model
 from services.slam.config import SlamConfig
 from services.slam.features import Extractor
+from services.slam.depth_noise import DepthNoise
 from services.slam.lag import Lag, carried_back
 from services.slam.motion import Velocity
 from services.slam.slam import Slam
@@ -36,7 +37,7 @@ def test_features_get_the_depth_that_they_had(after_s: float) -> None:
     step = inverse(swing(at_s)) @ swing(at_s + step_s)
     R = step[:3, :3]
     velocity = Velocity(step[:3, 3] / step_s, np.array([R[2, 1], R[0, 2], R[1, 0]]) / step_s)
-    extractor, lag = Extractor(INTRINSICS, FEW), Lag(INTRINSICS, camera_model(INTRINSICS, FEW), FEW)
+    extractor, lag = Extractor(INTRINSICS, FEW), Lag(INTRINSICS, camera_model(INTRINSICS, FEW), FEW, DepthNoise(0.6))
     wanted, features = extractor.extract(grey, true_m).depth, extractor.extract(grey, late_m)
     untold = np.median(np.abs(features.depth - wanted))
     lag.begin(late_m, after_s)
