@@ -8,8 +8,8 @@ import pytest
 from services.common.geometry import inverse
 from services.slam.camera import camera_model
 from services.slam.config import SlamConfig
-from services.slam.features import Extractor
 from services.slam.depth_noise import DepthNoise
+from services.slam.features import Extractor
 from services.slam.lag import Lag, carried_back
 from services.slam.motion import Velocity
 from services.slam.slam import Slam
