@@ -28,6 +28,8 @@ def test_what_holds_is_not_complained_of() -> None:
         ({"armings": 2}, "armed 2 times"), ({"replays_refused": False}, "second time"), ({"trees_lost": 1}, "1 trees lost"),
         ({"reason": ""}, "without a reason"), ({"armed_after": True}, "armed"), ({"end": "hold"}, "neither went on nor ended"),
         ({"end": ""}, "no word"),
+        ({"end": "idle"}, "neither went on nor ended"),
+        ({"end": "idle", "bridge_landed": "no guidance: landing", "armed_after": True}, "neither went on nor ended"),
     ],
 )  # fmt: skip
 def test_whatever_does_not_hold_is_named(change: dict[str, object], word: str) -> None:
@@ -50,6 +52,12 @@ def test_what_each_loss_asks_of_the_flight() -> None:
 def test_a_mission_that_flies_on_is_well() -> None:
     assert list(common(replace(GOOD, end="approach", reason="on"))) == []
     assert list(common(replace(GOOD, end="landing", armed_after=True))) == []
+
+
+def test_a_mission_that_the_bridge_ended_while_the_navigator_hung_is_well() -> None:
+    """A hung navigator is noticed after 10 s; the bridge holds for 6 s and lands, and the new navigator knows no mission."""
+    ended = replace(GOOD, end="idle", reason="waiting for a start command", bridge_landed="no guidance: landing")
+    assert list(faults_of("navigator", ended, Limits())) == []
 
 
 def test_the_worst_of_several_counts() -> None:

@@ -132,6 +132,11 @@ class Flown:
         places = [t.T_map_camera.position_m[:2] for t in self.truths if from_ns <= t.stamp_ns <= until_ns]
         return max((float(np.hypot(p[0] - places[0][0], p[1] - places[0][1])) for p in places), default=0.0)
 
+    def bridge_landed(self, from_ns: int) -> str:
+        """Return why the bridge landed by itself after ``from_ns``, as it told; empty when it did not."""
+        words = (v.note for v in reversed(self.vehicles) if v.stamp_ns >= from_ns and "no guidance: landing" in v.note)
+        return next(words, "")
+
     def reason(self) -> str:
         """Return why the mission is in its state."""
         return self.states[-1].reason if self.states else ""

@@ -60,6 +60,8 @@ class Seen:
     replays_refused: bool
     trees_lost: int
     armed_after: bool
+    bridge_landed: str = ""
+    """Why the bridge landed by itself, in its own words: a navigator that comes back then finds no mission to go on with."""
 
 
 class Back(NamedTuple):
@@ -178,6 +180,7 @@ class Flights:
             words=tuple(dict.fromkeys(s.reason for s in flown.states if s.since_ns >= at_ns)),
             touches=flown.touches - touches, armings=flown.armings, starts=self.starts, replays_refused=self._replay_refused(),
             trees_lost=len(trees - self._trees()), armed_after=flown.armed,
+            bridge_landed=flown.bridge_landed(at_ns),
         )  # fmt: skip
         self._tell(line_of(seen))
         return seen
@@ -200,7 +203,7 @@ class Flights:
 
         def settled() -> bool:
             nonlocal since_ns
-            if flown.state in ENDED and not flown.armed:
+            if flown.state in {*ENDED, "idle"} and not flown.armed:
                 return True
             last = flown.states[-1] if flown.states else None
             calm = last is not None and last.stamp_ns > at_ns and last.state in FLYING - {"hold"} and not last.failsafe

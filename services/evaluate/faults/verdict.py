@@ -53,7 +53,8 @@ def common(seen: Seen) -> Iterator[str]:
         yield f"the mission ended ({seen.end}) without a reason"
     if seen.end in ENDED and seen.armed_after:
         yield f"the mission ended ({seen.end}) with the aircraft armed"
-    if seen.end not in ENDED and seen.end not in _MOVING | {"landing"}:
+    ended_by_bridge = seen.end == "idle" and seen.bridge_landed and not seen.armed_after
+    if seen.end not in ENDED and seen.end not in _MOVING | {"landing"} and not ended_by_bridge:
         yield f"the mission neither went on nor ended: {seen.end or 'no word'}, {seen.reason}"
 
 
