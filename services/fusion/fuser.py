@@ -89,7 +89,10 @@ class Fuser:
             return carried if self.guard.apart_m <= self.config.apart_m else None
         if located is not None:
             return self._follow(located)
-        return self._carry(stamp_ns) if self.smoother.inertial else None
+        if not self.smoother.inertial:
+            self._go_blind()
+            return None
+        return self._carry(stamp_ns)
 
     def second(self, stamp_ns: int, located: Located | None) -> Fused | None:
         """Take a frame of the second camera; a pose is returned only where it alone tells the motion (no IMU)."""
@@ -231,11 +234,16 @@ class Fuser:
         assert self.smoother is not None
         return self._told_at(self.smoother.step(stamp_ns))
 
-    def _told_at(self, state: State) -> Fused | None:
-        s, anchor = self._window()
+    def _go_blind(self) -> None:
+        """Note that the first camera is lost: what it sees next is a step over the gap, not one frame's."""
+        _, anchor = self._window()
         if not self._blind and self.gps is not None:
             self.gps.blind(anchor.located.stamp_ns)
         self._blind = True
+
+    def _told_at(self, state: State) -> Fused | None:
+        s, anchor = self._window()
+        self._go_blind()
         s.keep(anchor.index)
         if not self._settle(seen=self._second_sees(state.stamp_ns)):
             return None

@@ -248,3 +248,18 @@ def test_the_same_flight_gives_the_same_poses() -> None:
         if a is not None and b is not None:
             assert np.array_equal(a.T_map_camera, b.T_map_camera)
             assert np.array_equal(a.covariance, b.covariance)
+
+
+@pytest.mark.parametrize("gps", [False, True])
+def test_without_imu_a_place_found_again_is_a_step_over_the_gap(gps: bool) -> None:
+    """It was taken for one frame's step: after two dark seconds in a turn the world was 10 degrees off, and an honest GPS distrusted."""
+    fuser, rng = Fuser(FusionConfig(imu=False, gps=gps), T_BODY_CAMERA), np.random.default_rng(3)
+    for k in range(150):
+        t_s = k * FRAME_S
+        dark = 3.0 < t_s < 5.0
+        fuser.camera(stamp_ns(t_s), None if dark else located(t_s, rng, reset=int(t_s >= 5.0)))
+    assert fuser.smoother is not None
+    t_s = (fuser.smoother.last.stamp_ns - stamp_ns(0.0)) * 1e-9
+    off = inverse(true_body(t_s)) @ fuser.smoother.last.T_W_body
+    assert np.linalg.norm(off[:3, 3]) < 0.1
+    assert np.linalg.norm(log_rotation(off[:3, :3])) < np.radians(2.0)
