@@ -27,6 +27,9 @@ I32 = NDArray[np.int32]
 
 _COMPILED_KEYFRAMES = 24
 """Above this the cameras' system is large enough to pay for LAPACK."""
+_TRIES = 3
+"""Of a large adjustment that keyframes cut short: each goes on where the last one stopped. On a walk keyframes never cease, and trying
+for ever took half a core (6,000 frames: 1.28 cores); when the camera rests it is done in any case."""
 _REDUNDANT = 0.9
 _BEHIND, _REDUNDANT_BEHIND = 100, 0.6
 """A keyframe goes whose points three others see to such a share; and to this, once so many younger ones live."""
@@ -63,8 +66,8 @@ class Mapping:
         self.revision = 0
         """Up by one whenever poses of keyframes were corrected."""
         self.why: GraphReason = "local_ba"
-        self.owed = False
-        """A large adjustment was cut short."""
+        self.owed = 0
+        """Tries that a large adjustment has left that was put off or cut short."""
         self.turns = 0
         """Up by one whenever the whole map was turned."""
         self.turned: F64 = np.eye(3)
@@ -104,11 +107,18 @@ class Mapping:
         self._thin()
         self.pay(k)
 
+    def owe(self) -> None:
+        """Ask for a large adjustment when there is time."""
+        self.owed = _TRIES
+
     def pay(self, k: int) -> None:
-        """Do the large adjustment that was cut short, unless keyframes wait: then the next one asks again."""
-        if self.owed and not self.hurried():
-            self.owed = False
-            self.adjust_all(k)
+        """Do the large adjustment that is owed, unless keyframes wait: then the next one asks again."""
+        if not self.owed or self.hurried():
+            return
+        left, self.owed = self.owed - 1, 0
+        self.adjust_all(k)
+        if self.owed:  # cut short again
+            self.owed = left
 
     def _create(self, k: int) -> None:
         atlas, config = self.atlas, self.config
@@ -217,7 +227,8 @@ class Mapping:
             else:
                 adjust_large(problem, camera, part.free, rounds, robust, self.hurried)
                 if self.hurried():  # what was reached is taken, but not yet fit to say what does not fit
-                    self.owed, problem.use[:] = True, True
+                    problem.use[:] = True
+                    self.owe()
                     break
             gate(chi_squares(problem, camera), problem.info, 1.0, problem.use)
         with self.step():

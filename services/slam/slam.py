@@ -182,7 +182,7 @@ class Slam:
         if joined is None or joined[0].inliers < self.config.min_inliers:
             return None
         if self.shutter.learn(joined[0]):
-            self.mapping.owed = True
+            self.mapping.owe()
         self._unroll(joined[0], velocity)
         movers.mark(self.tracking, last, joined[0], self._motion.since_s(stamp_ns))
         believed = self._motion.plausible(stamp_ns, _step(last, joined[0]))

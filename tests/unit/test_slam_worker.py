@@ -14,6 +14,7 @@ from services.common.context import HealthBook
 from services.common.geometry import exp_rotation
 from services.slam.bundle import adjust
 from services.slam.config import SlamConfig
+from services.slam.mapping import Mapping
 from services.slam.maps import LiveMaps
 from services.slam.slam import Slam
 from services.slam.worker import Beside
@@ -236,6 +237,29 @@ def test_a_large_adjustment_gives_way_to_a_keyframe_and_is_made_up_for(monkeypat
     slam.mapping.settle(int(slam.atlas.slots[-1]))
     assert slam.mapping.revision == revision + 2, "the window's adjustment, and the one that was owed"
     check_bookkeeping(slam)
+
+
+def test_where_keyframes_never_cease_a_large_adjustment_is_tried_three_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    slam = Slam(INTRINSICS, CONFIG)
+    for k, T in enumerate(turn_on_the_spot(30, 130.0)):
+        slam.track(k * PERIOD_NS, *look(T))
+    monkeypatch.setattr("services.slam.mapping._COMPILED_KEYFRAMES", 1)
+    busy, tries = False, 0
+    whole = type(slam.mapping).adjust_all
+
+    def interrupted(mapping: Mapping, *args: int) -> None:
+        nonlocal busy, tries
+        busy, tries = True, tries + 1
+        whole(mapping, *args)
+        busy = False
+
+    monkeypatch.setattr(type(slam.mapping), "hurried", lambda _: busy)
+    monkeypatch.setattr(type(slam.mapping), "adjust_all", interrupted)
+    slam.mapping.owe()
+    for _ in range(10):
+        slam.mapping.pay(int(slam.atlas.slots[-1]))
+    assert tries == 3
+    assert not slam.mapping.owed
 
 
 def test_what_has_fallen_behind_is_thinned_and_the_way_remains(monkeypatch: pytest.MonkeyPatch) -> None:
