@@ -105,7 +105,7 @@ def test_on_an_address_that_others_reach_a_token_is_asked_for(ground: Ground) ->
     ground.kill("station", signal.SIGTERM)
     ground.settings = ["station.host=0.0.0.0", f"station.token={TOKEN}"]
     ground.station(answer=403)  # to whoever has no token
-    assert f"?token={TOKEN}" in ground.said("station")
+    assert until(lambda: f"?token={TOKEN}" in ground.said("station"))
     assert get(ground.address)[0] == 403
     assert get(ground.address, Cookie=f"treedock_station={TOKEN}")[0] == 200
     assert get(f"{ground.address}?token=wrong{TOKEN}")[0] == 403
