@@ -74,11 +74,16 @@ def chi_squares(problem: Problem, camera: F64) -> F64:
 
 
 @njit(cache=True, nogil=True)
-def disparity_residuals(problem: Problem, camera: F64, least_info: float) -> F64:
-    """Return observed minus predicted disparity of the observations in use whose inverse variance is ``least_info`` or more."""
+def disparity_residuals(problem: Problem, camera: F64, least_info: float, measured: NDArray[np.bool_]) -> F64:
+    """Return observed minus predicted disparity of the observations in use whose inverse variance is ``least_info`` or more.
+
+    Only of points that are ``measured`` (M,): a far one's disparity is believed, not seen.
+    """
     out = np.empty(len(problem.pose))
     c, count = np.empty(3), 0
     for m in range(len(problem.X)):
+        if not measured[m]:
+            continue
         for o in range(problem.start[m], problem.start[m + 1]):
             if problem.use[o] and problem.info[o, 1] >= least_info:
                 k = problem.pose[o]

@@ -232,7 +232,8 @@ class Mapping:
                     break
             gate(chi_squares(problem, camera), problem.info, 1.0, problem.use)
         with self.step():
-            self.depth_noise.learn(disparity_residuals(problem, camera, self.depth_noise.least_info))
+            measured = self.atlas.points.parallax[part.ids] < 0.0
+            self.depth_noise.learn(disparity_residuals(problem, camera, self.depth_noise.least_info, measured))
             self._apply(part)
             self.why = why
 

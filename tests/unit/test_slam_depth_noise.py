@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from services.slam.bundle import disparity_residuals
 from services.slam.depth_noise import DepthNoise
 from services.slam.features import sample_depth
+from tests.unit.test_slam_kernels import CAMERA, scene
 
 BF = 42.0
 SIGMA_PX = 0.6
@@ -66,3 +68,16 @@ def test_a_thin_branch_has_a_depth() -> None:
     depth_m = np.full((40, 40), 6.0, np.float32)
     depth_m[:, 19:22] = 2.0
     assert sampled(depth_m)[0] == 2.0
+
+
+def test_what_is_believed_of_far_points_teaches_nothing_of_the_depths_noise() -> None:
+    rng = np.random.default_rng(4)
+    _, _, _, problem = scene(rng, 3, 40)
+    problem.info[:, 1] = 4.0
+    problem.obs[:, 2] += 0.1
+    measured = np.arange(40) < 30
+    problem.obs[90:, 2] += 5.0  # of the last ten points
+    found = disparity_residuals(problem, CAMERA, 1.0, measured)
+    assert len(found) == 90
+    assert found == pytest.approx(np.full(90, 0.1), abs=1e-9)
+    assert not len(disparity_residuals(problem, CAMERA, 5.0, measured))
