@@ -26,8 +26,9 @@ _SMEARED = 0.3
 and of real recordings by hand no image has less than 0.31 for another reason."""
 _SMEARED_MOST = 30
 """So many in a row are smeared at most: then that is how it looks here."""
-_NOISY = 0.5
-"""Laplacian's share of the variance: no lens draws so finely. Real recordings have 0.01 to 0.07, simulated forests 0.08 to 0.15."""
+_NOISY, _NOISY_TIMES = 0.5, 2.0
+"""Laplacian's share of the variance, and times the usual, that make an image noisy. Real recordings have 0.01 to 0.07, forests
+rendered at half size 0.08 to 0.15, at full size 1.3 to 1.7: pixel by pixel they are as fine as noise, and rain adds 4."""
 _BLANK = 0.25
 """Variance."""
 
@@ -36,25 +37,32 @@ class Sharpness:
     """Remembers what is usual."""
 
     def __init__(self) -> None:
-        self._usual: deque[float] = deque(maxlen=_REMEMBERED)
+        self._details: deque[float] = deque(maxlen=_REMEMBERED)
+        self._noises: deque[float] = deque(maxlen=_REMEMBERED)
         self._run = 0
 
     def judge(self, grey: U8) -> tuple[bool, U8]:
         """Return whether an image (H, W) is smeared, and the image, rid of single wrong pixels when it has many."""
         detail, noise = sharpness(grey)
-        if noise > _NOISY:
+        known = len(self._details) >= _LEAST_REMEMBERED
+        if known and noise > max(_NOISY, _NOISY_TIMES * _usual(self._noises)):
             import cv2
 
             return False, np.asarray(cv2.medianBlur(grey, 3), np.uint8)
-        known = len(self._usual) >= _LEAST_REMEMBERED
-        smeared = known and detail < _SMEARED * float(np.percentile(self._usual, _USUAL_PERCENT))
+        smeared = known and detail < _SMEARED * _usual(self._details)
         self._run = self._run + 1 if smeared else 0
         if self._run > _SMEARED_MOST:
-            self._usual.clear()
+            self._details.clear()
+            self._noises.clear()
             smeared, self._run = False, 0
         if not smeared:
-            self._usual.append(detail)
+            self._details.append(detail)
+            self._noises.append(noise)
         return smeared, grey
+
+
+def _usual(remembered: deque[float]) -> float:
+    return float(np.percentile(remembered, _USUAL_PERCENT))
 
 
 @njit(cache=True, nogil=True)

@@ -26,6 +26,12 @@ def textured(seed: int = 0, shape: tuple[int, int] = (240, 320)) -> U8:
     return np.clip(128.0 + 40.0 * soft / soft.std(), 0, 255).astype(np.uint8)
 
 
+def finest(seed: int) -> U8:
+    """As a renderer draws without a lens: half of the contrast changes from pixel to pixel."""
+    grain = np.random.default_rng(900 + seed).normal(0.0, 10.0, (240, 320))
+    return np.clip(textured(seed).astype(float) + grain, 0, 255).astype(np.uint8)
+
+
 def smear(grey: U8, length: int, *, upright: bool = False) -> U8:
     kernel = np.full((length, 1) if upright else (1, length), 1.0 / length, np.float32)
     return np.asarray(cv2.filter2D(grey, -1, kernel), np.uint8)
@@ -81,6 +87,19 @@ def test_single_wrong_pixels_are_taken_out_and_change_nothing_of_what_is_usual()
     assert np.median(off) <= 4
     assert judge.judge(clear)[0] is False
     assert judge.judge(smear(clear, 20))[0] is True
+
+
+def test_where_all_is_drawn_pixel_by_pixel_nothing_is_noisy_but_what_is_noisier() -> None:
+    judge = Sharpness()
+    for seed in range(20):
+        fine = finest(seed)
+        assert sharpness(fine)[1] > 1.0
+        smeared, same = judge.judge(fine)
+        assert smeared is False
+        assert same is fine
+    rained = rained_on(finest(30), 0.05)
+    assert judge.judge(rained)[1] is not rained
+    assert judge.judge(smear(finest(40), 20))[0] is True
 
 
 def test_a_blank_image_has_no_sharpness() -> None:
