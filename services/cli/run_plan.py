@@ -38,11 +38,13 @@ def with_trees(tree: TreedockConfig) -> TreedockConfig:
 
 
 def with_state(tree: TreedockConfig, folder: Path) -> TreedockConfig:
-    """Return ``tree`` with the map kept in an empty ``folder``: it outlives a service that dies, not the run."""
+    """Return ``tree`` with map and tree ids kept in an empty ``folder``: they outlive a service that dies, not the run."""
     shutil.rmtree(folder, ignore_errors=True)
     update: dict[str, object] = {}
     if tree.mapper.state_dir == "auto":
         update["mapper"] = tree.mapper.model_copy(update={"state_dir": str(folder)})
+    if tree.detector.state_dir == "auto":
+        update["detector"] = tree.detector.model_copy(update={"state_dir": str(folder)})
     if tree.slam.map_folder is None:
         update["slam"] = tree.slam.model_copy(update={"map_folder": folder / "slam"})
     return tree.model_copy(update=update)

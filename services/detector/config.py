@@ -96,3 +96,8 @@ class DetectorServiceConfig(BaseModel):
     """Updates without support after which a tree is withdrawn."""
     publish_move_m: float = 0.002
     """A tree that moved less than this, the rest the same, is no news."""
+    state_dir: str = "auto"
+    """Folder in which trees keep their ids when the detector is started again; ``off``; ``auto``: $STATE_DIRECTORY, else
+    ~/.local/state/treedock/<uav>, and off where time is simulated."""
+    await_map_s: float = Field(default=30.0, gt=0.0)
+    """Started again, it waits so long for the whole of the map whose trees it knows before it makes a list of a part."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
+from services.common.geometry import inverse
 from services.detector.config import DetectorServiceConfig
+from services.detector.map_store import Anchor, anchor_of
 from services.detector.model import Floats, Trunk
 
 
@@ -18,12 +20,13 @@ class TrackedTree:
 
     tree_id: int
     trunk: Trunk
+    """As it was last seen, moved with the map since."""
     observations: int
     """Updates that saw it."""
     missed: int
     """Updates since it was last seen."""
-    expected_m: Floats
-    """(3,) where its base should be now: the last position, moved with the map."""
+    anchor: Anchor | None = None
+    """The submap that its place was last measured against; None where none looks at it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +49,51 @@ class Identities:
 
     def __init__(self, config: DetectorServiceConfig) -> None:
         self._config = config
-        self._next = 1
+        self.next_id = 1
         self.trees: list[TrackedTree] = []
 
     def clear(self) -> None:
         """Forget all trees (a new map); ids are never used again."""
         self.trees = []
+
+    def take_up(self, trees: Sequence[TrackedTree]) -> None:
+        """Go on with the trees of an earlier run in the same map; their ids are below ``next_id``."""
+        self.trees = list(trees)
+
+    @property
+    def anchors(self) -> dict[int, Floats]:
+        """The submaps that trees are anchored to, with the poses (4, 4) that these had then."""
+        return {t.anchor.submap_id: t.anchor.T_map_submap for t in self.trees if t.anchor is not None}
+
+    def follow(self, poses: Mapping[int, Floats]) -> None:
+        """Move each tree with its anchor to where ``poses`` (4, 4) now have that; another tree's serves where its own is gone.
+
+        What no anchor leads stays where it was.
+        """
+        for tree, anchor in self._led_by(poses):
+            if anchor is None:
+                continue
+            now = poses[anchor.submap_id]
+            if not np.array_equal(now, anchor.T_map_submap):
+                tree.trunk = _moved(tree.trunk, now @ inverse(anchor.T_map_submap))
+
+    def forget_unled(self, poses: Mapping[int, Floats]) -> list[int]:
+        """Forget the trees that no anchor leads to where they are in ``poses``; return their ids."""
+        led = self._led_by(poses)
+        self.trees = [tree for tree, anchor in led if anchor is not None]
+        return [tree.tree_id for tree, anchor in led if anchor is None]
+
+    def _led_by(self, poses: Mapping[int, Floats]) -> list[tuple[TrackedTree, Anchor | None]]:
+        common = {submap_id: T for submap_id, T in self.anchors.items() if submap_id in poses}
+        return [
+            (t, t.anchor if t.anchor and t.anchor.submap_id in poses else anchor_of(np.array(t.trunk.base_m), common))
+            for t in self.trees
+        ]
+
+    def fasten(self, poses: Mapping[int, Floats]) -> None:
+        """Anchor each tree to the submap that looks at it most squarely, where ``poses`` (4, 4) have it."""
+        for tree in self.trees:
+            tree.anchor = anchor_of(np.array(tree.trunk.base_m), poses)
 
     def update(self, trunks: Sequence[Trunk]) -> list[TreeEvent]:
         """Match a whole new detection, nearest pairs first, each side once; return what happened to whom.
@@ -75,7 +117,6 @@ class Identities:
             matched.add(i)
             tree = owner[j] = self.trees[i]
             tree.trunk, tree.missed, tree.observations = trunks[j], 0, tree.observations + 1
-            tree.expected_m = np.array(trunks[j].base_m)
         events = self._lost([tree for i, tree in enumerate(self.trees) if i not in matched], trunks, owner)
         events += self._begun(trunks, owner, before)
         return events
@@ -104,8 +145,8 @@ class Identities:
         for j, trunk in enumerate(trunks):
             if j in owner:
                 continue
-            new = TrackedTree(self._next, trunk, 1, 0, np.array(trunk.base_m))
-            self._next += 1
+            new = TrackedTree(self.next_id, trunk, 1, 0)
+            self.next_id += 1
             origin = next(
                 (o for o in owner.values() if o.tree_id in before
                  and self._distance(new, o.trunk) < before[o.tree_id] + trunk.radius_m < 2.0 * before[o.tree_id]), None,
@@ -124,4 +165,13 @@ class Identities:
 
     @staticmethod
     def _distance(tree: TrackedTree, trunk: Trunk) -> float:
-        return float(np.hypot(tree.expected_m[0] - trunk.base_m[0], tree.expected_m[1] - trunk.base_m[1]))
+        a, b = tree.trunk.base_m, trunk.base_m
+        return float(np.hypot(a[0] - b[0], a[1] - b[1]))
+
+
+def _moved(trunk: Trunk, T: Floats) -> Trunk:
+    """Return a trunk moved by ``T`` (4, 4) of the map."""
+    x, y, z = T[:3, :3] @ trunk.base_m + T[:3, 3]
+    axis = T[:3, :3] @ trunk.axis
+    ax, ay, az = axis / np.linalg.norm(axis)
+    return replace(trunk, base_m=(float(x), float(y), float(z)), axis=(float(ax), float(ay), float(az)))

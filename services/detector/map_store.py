@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.mapping import MapIndex, Submap
-from services.common.geometry import inverse
 from services.detector.incremental import Cells, cells_of
 from services.detector.model import Floats, Views
 
@@ -42,6 +42,8 @@ class MapStore:
         self._touched: Cells = frozenset()
         self._epoch: int | None = None
         """The run of the mapper whose versions these are; None until an index told."""
+        self._index: MapIndex | None = None
+        """The last that was heard of this map."""
         self._absent: set[int] = set()
         """Held here, not listed in the last index: gone, or newer than the index."""
         self._patience_s, self._not_before_ns = _PATIENCE_S[0], 0
@@ -52,7 +54,7 @@ class MapStore:
 
     def clear(self, map_id: str) -> None:
         """Begin a new map."""
-        self.map_id, self.graph_version, self._held = map_id, 0, {}
+        self.map_id, self.graph_version, self._held, self._index = map_id, 0, {}, None
         self.changed_points, self._touched = 0, frozenset()
         self._patience_s, self._not_before_ns = _PATIENCE_S[0], 0
 
@@ -103,8 +105,8 @@ class MapStore:
         absent = set(self._held) - set(index.submap_ids)
         self._drop(absent & self._absent)
         self._absent = absent - self._absent
-        entries = zip(index.submap_ids, index.versions, index.placed_by, strict=True)
-        if all(self._is_as_new(*entry) for entry in entries):
+        self._index = index
+        if self.complete:
             self._patience_s = _PATIENCE_S[0]
             return False
         if now_ns < self._not_before_ns:
@@ -112,6 +114,14 @@ class MapStore:
         self._not_before_ns = now_ns + round(self._patience_s * 1e9)
         self._patience_s = min(2.0 * self._patience_s, _PATIENCE_S[1])
         return True
+
+    @property
+    def complete(self) -> bool:
+        """Whether an index of this map was heard and all that it lists is held."""
+        if self._index is None:
+            return False
+        entries = zip(self._index.submap_ids, self._index.versions, self._index.placed_by, strict=True)
+        return all(self._is_as_new(*entry) for entry in entries)
 
     def _is_as_new(self, submap_id: int, version: int, placed_by: int) -> bool:
         held = self._held.get(submap_id)
@@ -147,8 +157,17 @@ class MapStore:
         return {submap_id: held.T_map_submap for submap_id, held in self._held.items()}
 
 
-def anchor_of(position_m: Floats, poses: dict[int, Floats], reach_m: float = 6.0) -> int | None:
-    """Return the submap (id) that looks at a place most squarely, None when none does."""
+@dataclass(frozen=True, slots=True)
+class Anchor:
+    """A submap and where it stood: what a place of the map is remembered by."""
+
+    submap_id: int
+    T_map_submap: Floats
+    """(4, 4)."""
+
+
+def anchor_of(position_m: Floats, poses: Mapping[int, Floats], reach_m: float = 6.0) -> Anchor | None:
+    """Return the submap of ``poses`` (by id) that looks at a place (3,) most squarely, None when none does."""
     best, score = None, 0.0
     for submap_id, T in poses.items():
         to = position_m - T[:3, 3]
@@ -157,13 +176,8 @@ def anchor_of(position_m: Floats, poses: dict[int, Floats], reach_m: float = 6.0
             continue
         forward = float(T[:2, 2] @ to[:2]) / distance
         if forward > score:
-            best, score = submap_id, forward
+            best, score = Anchor(submap_id, T), forward
     return best
-
-
-def moved_with(position_m: Floats, before: Floats, after: Floats) -> Floats:
-    """Return where a place goes when its submap is moved from one pose to another."""
-    return (after @ inverse(before) @ np.append(position_m, 1.0))[:3]
 
 
 def _placed(points_m: NDArray[np.float32], T: Floats) -> NDArray[np.float32]:

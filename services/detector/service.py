@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import logging
+import os
 
 from schemas.codec import Wire
 from schemas.mapping import MapIndex, Submap
 from schemas.topics import MAP_CLOUD, MAP_INDEX, SLAM_POSE, TREES_LIST, TREES_TARGET
 from schemas.trees import Target, Tree, TreeList
 from services.common.context import Context
+from services.common.state import state_folder
 from services.detector.config import DetectorServiceConfig
 from services.detector.fusion import Fusion
 from services.detector.identity import Identities
 from services.detector.incremental import Incremental
-from services.detector.map_store import MapStore, anchor_of, moved_with
-from services.detector.model import DetectionResult, Floats
+from services.detector.map_store import MapStore
+from services.detector.model import DetectionResult
+from services.detector.names import NamesKeeper, SavedNames, TakingUp, saved_trees
 from services.detector.report import as_tree
 
 LOG = logging.getLogger(__name__)
 
 _ASK_TIMEOUT_S = 2.0
+_VERSIONS_LOST = 1000
+"""More lists than a run can have sent after it last wrote their number."""
 _QUIET_S = 2.0
 """When the map did not change for so long there is time to look at the whole of it."""
 
@@ -35,10 +40,19 @@ class DetectorService:
         self._fusion = Fusion(config.fusion)
         self._refined = False
         """Whether the refiner has said something since the last list."""
-        self._anchored: dict[int, Floats] = {}
-        """Poses of the submaps at the last detection."""
+        folder = state_folder(config.state_dir, context.uav, os.environ, simulated=context.clock.simulated)
+        health = context.health
+        self._keeper = None if folder is None else NamesKeeper(folder, context.uav, health.count, health.note)
+        self._saved = None if self._keeper is None else self._keeper.load()
+        """What the run before kept, until the first word of a map."""
+        self._taking_up: TakingUp | None = None
         self._incomplete = False
+        self._graph_version = 0
+        """Of the map at the last detection."""
         self._version = 0
+        if self._saved is not None:
+            self._identities.next_id = self._saved.next_id
+            self._version = self._saved.list_version + _VERSIONS_LOST
         self._published: TreeList | None = None
         self._incremental = Incremental(config.slicing)
         self._quiet = 0
@@ -49,6 +63,7 @@ class DetectorService:
         context.on(TREES_TARGET, self.on_target)
         context.every(1.0 / config.max_rate_hz, self.on_timer)
         context.answer_state(TREES_LIST, self.state)
+        context.on_stop(lambda: self._keep_names(at_once=True))
 
     def on_submap(self, submap: Submap) -> None:
         """Take up a change of the map."""
@@ -76,6 +91,8 @@ class DetectorService:
         """Detect when the map changed since the last time; else tell of what the refiner found since."""
         if self._incomplete:
             self._fetch_whole_map()
+        if not self._taken_up():
+            return
         self._quiet = 0 if self._store.changed_points > 0 else self._quiet + 1
         if self._store.changed_points > 0:
             self._detect()
@@ -104,7 +121,21 @@ class DetectorService:
         self._identities.clear()
         self._incremental.clear()
         self._fusion.clear(map_id)
-        self._anchored = {}
+        saved, self._saved, self._taking_up = self._saved, None, None
+        if saved is not None and saved.map_id == map_id and saved.trees:
+            self._identities.take_up(saved.tracked())
+            self._taking_up = TakingUp(saved.graph_version, self._context.clock.now_ns())
+            self._context.health.count("trees_taken_up", len(saved.trees))
+            self._incomplete = True
+
+    def _taken_up(self) -> bool:
+        """Return whether no trees of the run before wait for their map any more."""
+        if self._taking_up is not None:
+            now_ns, patience_s = self._context.clock.now_ns(), self._config.await_map_s
+            if not self._taking_up.over(self._identities, self._store, now_ns, patience_s):
+                return False
+            self._taking_up = None
+        return True
 
     def _fetch_whole_map(self) -> None:
         self._incomplete = False
@@ -121,7 +152,7 @@ class DetectorService:
 
     def _detect(self, *, whole: bool = False) -> None:
         health = self._context.health
-        self._follow_corrections()
+        self._identities.follow(self._store.poses())
         with health.timed("assemble"):
             points, views = self._store.assemble()
         touched = self._store.settle()
@@ -133,16 +164,9 @@ class DetectorService:
         for event in self._identities.update(result.trunks):
             health.count(f"trees_{event.kind}")
             LOG.info("%s", event)
-        self._anchored = dict(self._store.poses())
+        self._identities.fasten(self._store.poses())
+        self._graph_version = self._store.graph_version
         health.count("partial_detections" if self._incremental.partial else "detections")
-
-    def _follow_corrections(self) -> None:
-        """Move the expected place of each tree with the submap that sees it best."""
-        poses = self._store.poses()
-        for tree in self._identities.trees:
-            anchor = anchor_of(tree.expected_m, self._anchored)
-            if anchor is not None and anchor in poses:
-                tree.expected_m = moved_with(tree.expected_m, self._anchored[anchor], poses[anchor])
 
     def _trees(self, *, confirmed: bool) -> list[Tree]:
         kept = [t for t in self._identities.trees if t.missed == 0 or not confirmed]
@@ -163,7 +187,19 @@ class DetectorService:
             stamp_ns=self._context.clock.now_ns(), map_id=self._store.map_id, version=self._version,
             graph_version=self._store.graph_version, trees=trees,
         )  # fmt: skip
+        self._keep_names()  # before anybody hears of them
         self._context.publish(TREES_LIST, self._published)
+
+    def _keep_names(self, *, at_once: bool = False) -> None:
+        """Keep what the next run has to know, unless this one has not taken up the last one's yet."""
+        if self._keeper is None or self._published is None or self._taking_up is not None:
+            return
+        ids = self._identities
+        names = SavedNames(
+            map_id=self._store.map_id, graph_version=self._graph_version, list_version=self._version, next_id=ids.next_id,
+            trees=saved_trees(ids.trees),
+        )  # fmt: skip
+        self._keeper.keep(names, self._context.clock.now_ns(), at_once=at_once)
 
     def _news(self, old: tuple[Tree, ...], new: tuple[Tree, ...]) -> bool:
         if [t.id for t in old] != [t.id for t in new]:

@@ -119,8 +119,9 @@ def _tables(done: Sequence[TurnResult], short: WalkResult, again: WalkResult, lo
 
 def _saved(long: WalkResult) -> dict[str, float]:
     """Write and read a map of the size that the long walk made."""
+    from services.common.files import write_parts
     from services.mapper.dense_map import MapSubmap
-    from services.mapper.saved_map import SavedMap, unpack, write_map
+    from services.mapper.saved_map import SavedMap, pack, unpack
 
     rng, each = np.random.default_rng(0), max(1, long.points // long.keyframes)
     submaps = [
@@ -130,10 +131,11 @@ def _saved(long: WalkResult) -> dict[str, float]:
     with tempfile.TemporaryDirectory(prefix="treedock-map-") as folder:
         file = Path(folder) / "map.tdmap"
         begin = time.perf_counter()
-        size = write_map(file, SavedMap("m", 1, submaps))
+        write_parts(file, pack(SavedMap("m", 1, submaps)))
         middle = time.perf_counter()
         unpack(file.read_bytes())
         end = time.perf_counter()
+        size = file.stat().st_size
     return {
         "file_mb": round(size / 1e6, 1), "save_ms": round(1e3 * (middle - begin), 1),
         "load_ms": round(1e3 * (end - middle), 1),

@@ -1,9 +1,8 @@
-"""The map as bytes: whole and checked, or refused with the reason. And the file that holds one whole map, always."""
+"""The map as bytes: whole and checked, or refused with the reason."""
 
 from __future__ import annotations
 
 import json
-import os
 import struct
 import zlib
 from collections.abc import Iterator
@@ -88,53 +87,9 @@ def as_message(submap: MapSubmap, map_id: str, graph_version: int, *, points: bo
     )  # fmt: skip
 
 
-def write_map(file: Path, saved: SavedMap) -> int:
-    """Write a map so that ``file`` is always whole: beside it, to the disk, then renamed. Return its bytes.
-
-    Raises:
-        OSError: the disk refused; the old file is then untouched.
-    """
-    file.parent.mkdir(parents=True, exist_ok=True)
-    partial = file.with_name(f".{file.name}.partial")
-    size = 0
-    with partial.open("wb") as stream:
-        for part in pack(saved):
-            size += stream.write(part)
-        stream.flush()
-        os.fsync(stream.fileno())
-    partial.replace(file)
-    folder = os.open(file.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
-    return size
-
-
-def set_aside(file: Path) -> Path:
-    """Rename a file that cannot be used, so that somebody may look at it; return its new name. The last one is kept."""
-    return file.replace(file.with_name(f"{file.name}.bad"))
-
-
-def map_file(state_dir: str, uav: str, environment: dict[str, str], *, simulated: bool) -> Path | None:
-    """Return where the map of an aircraft is kept, None when it is not.
-
-    Args:
-        state_dir: ``off``, a folder, or ``auto``: the unit's state directory (systemd's STATE_DIRECTORY), else
-            ``~/.local/state/treedock/<uav>``.
-        uav: the aircraft's name.
-        environment: of the process.
-        simulated: time is simulated: maps of two runs may then bear one name, and ``auto`` means ``off``.
-    """
-    if state_dir == "off" or (state_dir == "auto" and simulated):
-        return None
-    if state_dir != "auto":
-        return Path(state_dir) / f"map-{uav}.tdmap"
-    given = environment.get("STATE_DIRECTORY", "").split(":")[0]
-    if given:
-        return Path(given) / f"map-{uav}.tdmap"
-    home = environment.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
-    return Path(home) / "treedock" / uav / f"map-{uav}.tdmap"
+def map_file(folder: Path, uav: str) -> Path:
+    """Return the file of an aircraft's map in the folder of its state."""
+    return folder / f"map-{uav}.tdmap"
 
 
 def _part(body: bytes) -> bytes:

@@ -21,6 +21,7 @@ from schemas.topics import MAP_CLOUD, MAP_GROUND, MAP_INDEX, MAP_SKETCH, SLAM_GR
 from services.camera.codecs import FrameError, decode_colour_image, decode_depth
 from services.common.context import Context
 from services.common.geometry import from_transform, inverse
+from services.common.state import state_folder
 from services.mapper.cloud import KeyframeCloud, keyframe_cloud, pixel_rays
 from services.mapper.config import MapperConfig
 from services.mapper.dense_map import DenseMap, MapCloud, MapSubmap
@@ -57,7 +58,8 @@ class MapperService:
         self._epoch = context.clock.now_ns()
         self._index_due_ns = 0
         self._news, self._unsaved = False, False
-        file = map_file(config.state_dir, context.uav, dict(os.environ), simulated=context.clock.simulated)
+        folder = state_folder(config.state_dir, context.uav, os.environ, simulated=context.clock.simulated)
+        file = None if folder is None else map_file(folder, context.uav)
         self._keeper = None if file is None else MapKeeper(file, context.health.count, context.health.note)
         self._saved: SavedMap | None = None if self._keeper is None else self._keeper.load()
         self._held_back: list[Keyframe] = []

@@ -27,8 +27,8 @@ def approach(b: Board, since_s: float) -> Intent | Next:
     """Entry: the target is ahead. Exit: near enough -> dock; no way to it, or not in time -> select."""
     del since_s
     c, here, seen = b.config, b.here, b.to_axis()
-    if b.axis_m is None:
-        return Next("select", "the target is gone from the map")
+    if b.axis_m is None or b.following.astray:
+        return gone(b)
     if here is None or seen is None:
         return Intent("stop", "freeze")
     distance, bearing = seen
@@ -93,6 +93,13 @@ def give_up(b: Board, reason: str) -> Next:
     b.finish_target(visited=False)
     b.drop_target()
     return Next("select", reason)
+
+
+def gone(b: Board) -> Next:
+    """Choose anew, as the target is not in the map any more or its id is another tree's; it is not given up for good."""
+    why = b.following.astray or "the target is gone from the map"
+    b.drop_target()
+    return Next("select", why)
 
 
 def at_height(b: Board, xy: Matrix) -> Matrix:

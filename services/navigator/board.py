@@ -186,7 +186,8 @@ class Board:
     def discs(self, keep_out_m: float) -> list[Disc]:
         """Return what is in the way but the target, grown by ``keep_out_m``: listed trunks, seen things, moving ones."""
         z = self.flight_z_m
-        places = [(axis_at(t, z), t) for t in self.trees if t.id != self.target_id]
+        astray = bool(self.following.astray)
+        places = [(axis_at(t, z), t) for t in self.trees if astray or t.id != self.target_id]
         mapped = [Disc(float(p[0]), float(p[1]), t.radius_m + keep_out_m) for p, t in places]
         return mapped + (self.around.discs(keep_out_m, self.now_ns) if self.config.live_guard else [])
 
@@ -250,7 +251,7 @@ class Board:
     def choose(self, tree: Tree) -> None:
         """Make a listed tree the target."""
         self.target_id, self.wanted_id = tree.id, None
-        self.following.list_version = -1
+        self.following.list_version, self.following.astray = -1, ""
         self.target_since_ns, self.looking = self.now_ns, False
         self.ground_z_m = tree.z_m
         self.axis_m = self.target_seen_ns = None
@@ -272,7 +273,7 @@ class Board:
     def drop_target(self) -> None:
         """Have no target any more."""
         self.target_id, self.axis_m, self.dock_direction, self.target_seen_ns = None, None, None, None
-        self.looking = False
+        self.looking, self.following.astray = False, ""
         self.dock.clear()
 
     def _correct(self, c: Correction) -> None:

@@ -178,7 +178,7 @@ def _present(b: Board, held: ClaimGoal) -> tuple[float, float] | None:
     if held.kind != "tree":
         return None if b.home_m is None or not b.home_known else _flat(b.home_m)
     tree = next((t for t in b.trees if t.id == held.tree_id), None)
-    return None if tree is None else (tree.x_m, tree.y_m)
+    return None if tree is None or b.following.astray else (tree.x_m, tree.y_m)
 
 
 def _flat(p: Matrix) -> tuple[float, float]:

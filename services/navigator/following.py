@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 _AXIS_TIME_CONSTANT_S = 0.4
 _AXIS_GATE_M = 0.6
+JUMPED_M = 0.5
+"""A listed tree that far from the target's believed axis is another tree: corrections move both alike."""
 
 
 @dataclass
@@ -27,22 +29,31 @@ class Following:
     list_version: int = -1
     off_gate: bool = False
     """The depth image shows a trunk where the map has none: not our target, whatever its id."""
+    astray: str = ""
+    """Why the target's id names another tree now; empty when it does not."""
     _stamp_ns: int = -1
 
     def list_changed(self, b: Board) -> None:
-        """Keep to the target when the list changes: under another id, and, until it is seen, at another place."""
+        """Keep to the target when the list changes: under another id, and, until it is seen, at another place.
+
+        A place far from where the target is believed is another tree's: it is never followed there. Where no other id
+        is at the target's place either, ``astray`` says so.
+        """
         seen = b.inputs.trees
         if seen is None or b.axis_m is None or seen.message.version == self.list_version:
             return
-        self.list_version = seen.message.version
+        self.list_version, self.astray = seen.message.version, ""
         z, axis = b.flight_z_m, b.axis_m
         named = next((t for t in b.trees if t.id == b.target_id), None)
-        if named is None:
+        off_m = 0.0 if named is None else float(np.linalg.norm(axis_at(named, z) - axis))
+        if named is None or off_m > JUMPED_M:
             near = [(float(np.linalg.norm(axis_at(t, z) - axis)), t.id, t) for t in b.trees if t.suitable]
-            distance, _, named = min(near, default=(float("inf"), 0, None))
-            if named is None or distance > SAME_TREE_M:
+            distance, _, at_place = min(near, default=(float("inf"), 0, None))
+            if at_place is None or distance > SAME_TREE_M:
+                if named is not None:
+                    self.astray = f"the list has tree {b.target_id} {off_m:.1f} m from where it was"
                 return
-            b.target_id = named.id
+            named, b.target_id = at_place, at_place.id
         if b.target_seen_ns is None:
             b.axis_m, b.ground_z_m = axis_at(named, z), named.z_m
 

@@ -18,6 +18,7 @@ from services.navigator.approaching import (
     approach,
     at_height,
     give_up,
+    gone,
     yaw_to_axis,
 )
 from services.navigator.board import Board
@@ -162,8 +163,8 @@ def _claimed(b: Board, choice: Choice) -> Result:
 def face(b: Board, since_s: float) -> Result:
     """Entry: a target chosen. Exit: it is ahead and tracked (or too far to be) -> approach; not seen -> select."""
     c, seen = b.config, b.to_axis()
-    if b.axis_m is None:
-        return Next("select", "the target is gone from the map")
+    if b.axis_m is None or b.following.astray:
+        return gone(b)
     if b.here is None or seen is None:
         return Intent("stop", "freeze")
     distance, bearing = seen
@@ -189,6 +190,8 @@ def dock(b: Board, since_s: float) -> Result:
     if b.here is None or seen is None:
         return Intent("stop", "freeze")
     distance, bearing = seen
+    if b.following.astray:
+        return Next("undock", b.following.astray)
     if distance > c.dock.leave_m:
         return Next("approach", f"pushed off to {distance:.2f} m")
     verdict = b.dock.verdict(float("inf") if c.handheld else since_s)

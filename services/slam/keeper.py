@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import struct
 import time
 import zipfile
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from numba import njit
@@ -15,6 +13,7 @@ from numpy.typing import NDArray
 
 from schemas.camera import Intrinsics
 from services.common.errors import InputError
+from services.common.state import boot_id
 from services.slam.config import SlamConfig
 from services.slam.features import Features, grid_of, grid_size
 from services.slam.links import Keyframes, Points, describe, observe
@@ -31,23 +30,6 @@ _AGAIN, _AGAIN_NS = 3, 60_000_000_000
 _VERSIONS_LOST = 1000
 _RESETS_LOST = 16
 """More graphs and jumps than can have been told after the last that was written."""
-
-
-def state_folder(uav: str) -> Path:
-    """Return where a service keeps its state: systemd's directory for it, else the user's."""
-    given = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
-    if given:
-        return Path(given) / "slam"
-    home = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state")
-    return home / "treedock" / uav / "slam"
-
-
-def boot_id() -> str:
-    """Return what names this boot of the machine; empty where the kernel does not tell."""
-    try:
-        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
-    except OSError:
-        return ""
 
 
 def since_boot_ns() -> int:

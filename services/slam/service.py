@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,8 +14,8 @@ from schemas.vehicle import VehicleState
 from services.camera.codecs import FrameError, decode_colour, decode_depth_raw, recode
 from services.common.context import Context
 from services.common.geometry import R_BODY_CAMERA, Matrix, rotation_from_quaternion, to_transform
+from services.common.state import user_state
 from services.slam.config import SlamConfig
-from services.slam.keeper import state_folder
 from services.slam.maps import LiveMaps, LockstepMap, Maps
 from services.slam.messages import Nodes, pose_message
 from services.slam.results import GraphUpdate, TrackResult
@@ -42,7 +44,7 @@ def _maps(context: Context) -> Maps:
     if context.lockstep:
         warm()
         return LockstepMap(config)
-    folder = (config.map_folder or state_folder(context.uav)) if config.keep_map else None
+    folder = (config.map_folder or user_state(context.uav, os.environ) / "slam") if config.keep_map else None
     maps = LiveMaps(config, folder, context.health)
     warm_beside(maps.crew)
     return maps

@@ -6,7 +6,7 @@ import pytest
 from services.common.geometry import level_camera
 from services.detector.config import DetectorServiceConfig
 from services.detector.identity import Identities
-from services.detector.map_store import anchor_of, moved_with
+from services.detector.map_store import anchor_of
 from services.detector.model import Trunk
 
 
@@ -59,27 +59,35 @@ def test_close_trees_do_not_swap() -> None:
     assert _ids(ids) == {1: (1.08, 0.0), 2: (1.40, 0.0)}
 
 
-def test_a_tree_follows_the_submap_that_sees_it() -> None:
+def test_the_anchor_is_the_submap_that_looks_at_it() -> None:
     poses = {4: level_camera([0, 0, 1.5], 0.0), 5: level_camera([0, 0, 1.5], np.pi / 2)}
-    assert anchor_of(np.array([3.0, 0.2, 0.0]), poses) == 4
-    assert anchor_of(np.array([0.2, 3.0, 0.0]), poses) == 5
-    assert anchor_of(np.array([0.0, -9.0, 0.0]), poses) is None
-    turned = level_camera([0, 0, 1.5], 0.1)
-    moved = moved_with(np.array([3.0, 0.0, 0.0]), poses[4], turned)
-    assert moved == pytest.approx([3 * np.cos(0.1), 3 * np.sin(0.1), 0.0])
+    found = [anchor_of(np.array(p), poses) for p in ([3.0, 0.2, 0.0], [0.2, 3.0, 0.0], [0.0, -9.0, 0.0])]
+    assert [a and a.submap_id for a in found] == [4, 5, None]
 
 
 def test_ids_follow_a_map_correction() -> None:
     ids = Identities(DetectorServiceConfig())
     ids.update([_trunk(4.0, 0.0), _trunk(4.0, 0.7)])
-    for t in ids.trees:  # a loop closes: everything turns by 0.15 rad, 0.6 m at 4 m
-        t.expected_m = moved_with(t.expected_m, level_camera([0, 0, 1.5], 0.0), level_camera([0, 0, 1.5], 0.15))
+    ids.fasten({1: level_camera([0, 0, 1.5], 0.0)})
+    ids.follow({1: level_camera([0, 0, 1.5], 0.15)})  # a loop closes: everything turns by 0.15 rad, 0.6 m at 4 m
     c, s = np.cos(0.15), np.sin(0.15)
+    assert _ids(ids)[2] == pytest.approx((4 * c - 0.7 * s, 4 * s + 0.7 * c))
     ids.update([_trunk(4 * c, 4 * s), _trunk(4 * c - 0.7 * s, 4 * s + 0.7 * c)])
     assert {t.tree_id: round(t.trunk.base_m[1], 2) for t in ids.trees} == {
         1: round(4 * s, 2),
         2: round(4 * s + 0.7 * c, 2),
     }
+
+
+def test_a_tree_whose_anchor_is_gone_follows_its_neighbours() -> None:
+    ids = Identities(DetectorServiceConfig())
+    ids.update([_trunk(4.0, 0.0), _trunk(4.0, 0.7), _trunk(-30.0, 0.0)])
+    ids.fasten({1: level_camera([0, 0, 1.5], 0.0), 2: level_camera([0, 0, 1.5], 0.3)})
+    assert [t.anchor and t.anchor.submap_id for t in ids.trees] == [1, 2, None]
+    ids.follow({2: level_camera([0.5, 0, 1.5], 0.3)})
+    assert _ids(ids) == {1: pytest.approx((4.5, 0.0)), 2: pytest.approx((4.5, 0.7)), 3: (-30.0, 0.0)}
+    assert ids.forget_unled({2: level_camera([0.5, 0, 1.5], 0.3)}) == [3]
+    assert list(_ids(ids)) == [1, 2]
 
 
 def test_what_happens_to_trees_is_told() -> None:

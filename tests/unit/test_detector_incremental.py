@@ -10,7 +10,7 @@ from services.detector.detect import detect_trees
 from services.detector.incremental import Incremental, cells_of
 from services.detector.model import DetectionResult, Views
 from tests.unit.detector_clouds import facing, ground, trunk
-from tests.unit.test_detector_service import EYE, _moved, _submap, _System
+from tests.unit.detector_world import EYE, System, moved, submap_of
 
 Points = NDArray[np.float32]
 
@@ -69,14 +69,14 @@ def test_a_change_nearly_everywhere_is_a_look_at_the_whole() -> None:
 
 
 def test_ids_live_through_parts_and_a_map_correction() -> None:
-    system = _System()
+    system = System()
     near, far = (_map(places).astype(np.float64) for places in (PLACES[:2], PLACES[2:]))
-    system.send(_submap(near[near[:, 0] < 0.0], 1), _submap(far[far[:, 0] > 0.0], 2))
+    system.send(submap_of(near[near[:, 0] < 0.0], 1), submap_of(far[far[:, 0] > 0.0], 2))
     names = {t.id: (round(t.x_m), round(t.y_m)) for t in system.lists[-1].trees}
     assert sorted(names.values()) == sorted((round(x), round(y)) for x, y in PLACES)
     shifted = EYE.copy()
     shifted[0, 3] += 0.3
-    system.send(_moved(_submap(far[far[:, 0] > 0.0], 2), shifted))  # a loop closes: half of the map moves
+    system.send(moved(submap_of(far[far[:, 0] > 0.0], 2), shifted))  # a loop closes: half of the map moves
     after = {t.id: t.x_m for t in system.lists[-1].trees}
     assert after.keys() == names.keys()
     for tree_id, (x, _) in names.items():

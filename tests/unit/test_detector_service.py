@@ -3,51 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from schemas.mapping import Submap
 from schemas.topics import MAP_CLOUD, TREES_LIST
 from schemas.trees import Tree, TreeList
-from services.common.config import TreedockConfig
 from services.common.geometry import inverse, level_camera
-from services.common.memory import Hub
-from services.detector.service import DetectorService, build
 from tests.unit.detector_clouds import Floats, facing, ground, trunk
-
-EYE = level_camera([0.0, 0.0, 1.5], 0.0)
-
-
-def _submap(points_map: Floats, submap_id: int = 1, version: int = 1, map_id: str = "m1", T: Floats = EYE) -> Submap:
-    local = (points_map - T[:3, 3]) @ T[:3, :3]
-    n = len(local)
-    return Submap(
-        map_id=map_id, submap_id=submap_id, version=version, graph_version=3, stamp_ns=0, T_map_submap=T,
-        points_m=local.astype(np.float32), view=np.zeros(n, dtype=np.uint16), origins_m=np.zeros((1, 3), dtype=np.float32),
-        colour=np.zeros((0, 3), dtype=np.uint8),
-    )  # fmt: skip
-
-
-def _moved(submap: Submap, T: Floats) -> Submap:
-    none = np.zeros((0, 3), dtype=np.float32)
-    return Submap(
-        map_id=submap.map_id, submap_id=submap.submap_id, version=submap.version, graph_version=4, stamp_ns=0, T_map_submap=T,
-        points_m=none, view=np.zeros(0, dtype=np.uint16), origins_m=none, colour=np.zeros((0, 3), dtype=np.uint8),
-    )  # fmt: skip
-
-
-class _System:
-    def __init__(self) -> None:
-        self.hub = Hub(TreedockConfig())
-        self.detector: DetectorService = build(self.hub.context("detector"))
-        self.lists: list[TreeList] = []
-        self.mapper = self.hub.context("mapper")
-        self.whole: list[Submap] = []
-        self.mapper.answer_state(MAP_CLOUD, lambda: list(self.whole))
-        self.hub.context("navigator").on(TREES_LIST, self.lists.append)
-
-    def send(self, *submaps: Submap) -> None:
-        for submap in submaps:
-            self.mapper.publish(MAP_CLOUD, submap)
-        self.hub.run()
-        self.hub.advance_to(self.hub.clock.now_ns() + 500_000_000)
+from tests.unit.detector_world import EYE, System, moved, submap_of
 
 
 def _forest(seed: int = 1) -> Floats:
@@ -57,8 +17,8 @@ def _forest(seed: int = 1) -> Floats:
 
 
 def test_trees_are_published_once_and_answered() -> None:
-    system = _System()
-    system.send(_submap(_forest()))
+    system = System()
+    system.send(submap_of(_forest()))
     (told,) = system.lists
     assert [(round(t.x_m), round(t.y_m, 1)) for t in told.trees] == [(3, 0.4), (4, -1.5)]
     assert told.graph_version == 3
@@ -70,19 +30,19 @@ def test_trees_are_published_once_and_answered() -> None:
 
 
 def test_a_place_without_trees_gives_an_empty_list() -> None:
-    system = _System()
-    system.send(_submap(ground()))
+    system = System()
+    system.send(submap_of(ground()))
     assert [told.trees for told in system.lists] == [()]
     assert system.detector.final_trees() == []
 
 
-def test_ids_follow_a_moved_submap() -> None:
-    system = _System()
-    submap = _submap(_forest())
+def test_ids_follow_a_movedsubmap_of() -> None:
+    system = System()
+    submap = submap_of(_forest())
     system.send(submap)
     before = {t.id: t for t in system.lists[-1].trees}
     turned = level_camera([0.0, 0.0, 1.5], 0.2)
-    system.send(_moved(submap, turned))
+    system.send(moved(submap, turned))
     after = {t.id: t for t in system.lists[-1].trees}
     assert after.keys() == before.keys()
     for tree_id, tree in before.items():
@@ -91,29 +51,29 @@ def test_ids_follow_a_moved_submap() -> None:
 
 
 def test_a_missed_delta_is_made_up_for() -> None:
-    system = _System()
-    submap = _submap(_forest())
+    system = System()
+    submap = submap_of(_forest())
     system.whole = [submap]
-    system.send(_moved(submap, EYE))  # a move of a submap never heard of
+    system.send(moved(submap, EYE))  # a move of a submap never heard of
     assert len(system.lists[-1].trees) == 2
     assert system.detector._context.health.counters["map_queries"] == 1
 
 
 def test_withdrawn_and_new_maps() -> None:
-    system = _System()
-    system.send(_submap(_forest()))
-    system.send(_submap(ground(), map_id="m2"))
+    system = System()
+    system.send(submap_of(_forest()))
+    system.send(submap_of(ground(), map_id="m2"))
     assert system.lists[-1].map_id == "m2"
     assert len(system.lists[-1].trees) == 0
-    system.send(_submap(_forest(2), submap_id=2, map_id="m2"))
+    system.send(submap_of(_forest(2), submap_id=2, map_id="m2"))
     newest: tuple[Tree, ...] = system.lists[-1].trees
     assert [t.id for t in newest] == [3, 4], "ids of an old map are not given again"
 
 
 def test_a_map_that_changes_all_the_time_gives_at_most_five_lists_a_second() -> None:
-    system = _System()
+    system = System()
     for tick in range(40):  # 20 changes a second for two seconds, each of them news: the trees move by 1 cm
-        system.mapper.publish(MAP_CLOUD, _submap(_forest() + np.array([0.01 * tick, 0.0, 0.0]), version=tick + 1))
+        system.mapper.publish(MAP_CLOUD, submap_of(_forest() + np.array([0.01 * tick, 0.0, 0.0]), version=tick + 1))
         system.hub.run()
         system.hub.advance_to(system.hub.clock.now_ns() + 50_000_000)
     stamps = np.array([told.stamp_ns for told in system.lists]) * 1e-9

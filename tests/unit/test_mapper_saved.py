@@ -11,12 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from services.common.config import TreedockConfig
+from services.common.errors import InputError
+from services.common.files import write_parts
 from services.common.geometry import level_camera, pose, rotation_z
 from services.common.memory import Hub
+from services.common.state import state_folder
 from services.mapper.config import MapperConfig
 from services.mapper.dense_map import MapSubmap
 from services.mapper.keeper import MapKeeper
-from services.mapper.saved_map import SavedMap, SavedMapError, map_file, pack, unpack, write_map
+from services.mapper.saved_map import SavedMap, SavedMapError, pack, unpack
 from tests.unit.test_mapper_deltas import Consumer, World, same
 
 
@@ -66,15 +69,15 @@ def test_a_file_cut_anywhere_is_refused(size: int) -> None:
 
 
 def test_a_failed_write_leaves_the_old_map(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = tmp_path / "state" / "map-uav1.tdmap"
-    write_map(file, saved(2))
+    file = tmp_path / "map-uav1.tdmap"
+    write_parts(file, pack(saved(2)))
 
     def full(_: int) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space"):
-        write_map(file, saved(3))
+    with pytest.raises(InputError, match="No space"):
+        write_parts(file, pack(saved(3)))
     assert len(unpack(file.read_bytes()).submaps) == 2
 
 
@@ -88,14 +91,14 @@ def test_a_disk_that_refuses_is_told_and_counted(tmp_path: Path) -> None:
     assert "map.tdmap: cannot be written" in notes["map file"]
 
 
-def test_where_the_map_is_kept() -> None:
+def test_where_state_is_kept() -> None:
     environment = {"STATE_DIRECTORY": "/var/lib/treedock:/x", "XDG_STATE_HOME": "/h"}
-    assert map_file("auto", "uav1", environment, simulated=False) == Path("/var/lib/treedock/map-uav1.tdmap")
+    assert state_folder("auto", "uav1", environment, simulated=False) == Path("/var/lib/treedock")
     environment.pop("STATE_DIRECTORY")
-    assert map_file("auto", "uav1", environment, simulated=False) == Path("/h/treedock/uav1/map-uav1.tdmap")
-    assert map_file("auto", "uav1", environment, simulated=True) is None
-    assert map_file("off", "uav1", environment, simulated=False) is None
-    assert map_file("/here", "uav1", environment, simulated=True) == Path("/here/map-uav1.tdmap")
+    assert state_folder("auto", "uav1", environment, simulated=False) == Path("/h/treedock/uav1")
+    assert state_folder("auto", "uav1", environment, simulated=True) is None
+    assert state_folder("off", "uav1", environment, simulated=False) is None
+    assert state_folder("/here", "uav1", environment, simulated=True) == Path("/here")
 
 
 def kept_world(folder: Path) -> World:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from services.navigator.config import NavigatorConfig
 from tests.unit.navigator_world import STEP_S, World, tree
@@ -48,6 +49,55 @@ def test_the_target_keeps_its_trunk_when_the_list_numbers_anew() -> None:
     assert world.run("docked") == "docked", world.mission.reason
     assert world.mission.board.visited_ids == [before + 10]
     assert "hold" not in _course(world)
+
+
+def swapped(world: World) -> None:
+    """The list gives the two trees each other's id."""
+    world.trees = [t.model_copy(update={"id": 3 - t.id}) for t in world.trees]
+    world.revision += 1
+
+
+@pytest.mark.parametrize("state", ["face", "approach", "dock"])
+def test_ids_that_change_trees_take_the_target_nowhere(state: str) -> None:
+    """A detector that forgot its ids may call another tree by the target's: the place counts, seen already or not."""
+    world = World()
+    world.start()
+    world.run(state)
+    b = world.mission.board
+    before, axis = b.target_id, np.array(b.axis_m)
+    swapped(world)
+    assert world.run("docked") == "docked", world.mission.reason
+    assert b.visited_ids == [3 - (before or 0)]
+    assert np.linalg.norm(b.axis_m - axis) < 0.1
+    assert "hold" not in _course(world)
+
+
+@pytest.mark.parametrize("state", ["face", "approach", "dock"])
+def test_a_target_that_stands_elsewhere_all_at_once_is_not_followed_there(state: str) -> None:
+    """The id names a tree 1.5 m away and nothing is listed where the target was: chosen anew, and the reason is told."""
+    world = World(trees=[tree(1, -3.0, 2.0), tree(2, 4.0, 1.0, suitable=False)])
+    world.start()
+    world.run(state)
+    jumped_ns = world.now_ns
+    world.trees = [t.model_copy(update={"y_m": t.y_m - 1.5}) if t.id == 1 else t for t in world.trees]
+    world.revision += 1
+    assert world.run("select", 20.0) == "select"
+    why = next(e for e in world.events if e.stamp_ns > jumped_ns)
+    assert why.reason == "the list has tree 1 1.5 m from where it was"
+    assert why.after == ("undock" if state == "dock" else "select")
+    assert world.mission.board.target_id is None
+    assert world.run("docked", 120.0) == "docked", world.mission.reason
+    assert 0.85 <= np.linalg.norm(np.array([-3.0, 0.5]) - world.position_m[:2]) <= 1.0
+
+
+def test_a_tree_that_bears_the_targets_id_is_in_the_way_like_any_other() -> None:
+    world = World()
+    world.start()
+    world.run("face")
+    board = world.mission.board
+    assert len(board.discs(0.0)) == len(world.trees) - 1, "the target is no obstacle"
+    board.following.astray = "the list has it elsewhere"
+    assert len(board.discs(0.0)) == len(world.trees)
 
 
 def test_a_trunk_in_front_is_flown_around_and_hides_nothing_forever() -> None:
