@@ -225,7 +225,8 @@ def test_a_run_keeps_its_map_in_its_own_folder_and_begins_without_one(tmp_path: 
     folder = tmp_path / "state"
     folder.mkdir()
     (folder / "map-uav1.tdmap").write_bytes(b"of the last run")
-    assert with_state(TreedockConfig(), folder).mapper.state_dir == str(folder)
+    kept = with_state(TreedockConfig(), folder)
+    assert kept.mapper.state_dir == kept.detector.state_dir == str(folder)
     assert not folder.exists()
     off = TreedockConfig(mapper=MapperConfig(state_dir="off"))
     assert with_state(off, folder).mapper.state_dir == "off"
