@@ -22,6 +22,7 @@ from services.common.memlock import lockable_bytes
 from services.common.version import running_version
 from services.doctor.model import Facts, ServiceFact, VehicleFact
 from services.doctor.told import told
+from services.security.identity import STATION
 
 if TYPE_CHECKING:
     from services.common.config import TreedockConfig
@@ -43,6 +44,7 @@ def gather(config: TreedockConfig) -> Facts:
         vehicle=None if heard.vehicle is None else _vehicle(heard.vehicle),
         version=running_version(),
         units=_units(),
+        station=_is_station(config.security.identity),
         certificates=_certificates(folder) if folder else {},
         loose_keys=_loose_keys(folder) if folder else (),
         foreign_keys=_foreign_keys(folder) if folder else (),
@@ -159,6 +161,17 @@ def _units() -> dict[str, str]:
     done = subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=False)
     rows = [line.split() for line in done.stdout.splitlines()]
     return {row[0]: row[2] for row in rows if len(row) > 2 and row[1] == "loaded"}
+
+
+def _is_station(identity: str) -> bool:
+    """Return whether this machine is a ground station alone, by its certificate's name or the target that it starts."""
+    if identity:
+        return identity.startswith(f"{STATION}.")
+    if shutil.which("systemctl") is None:
+        return False
+    command = ["systemctl", "is-enabled", "treedock.target", "treedock-station.target"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=False)
+    return done.stdout.split()[-1:] == ["enabled"] and not done.stdout.startswith("enabled")
 
 
 def _certificates(folder: Path) -> dict[str, float]:

@@ -18,16 +18,8 @@ LEAST_LOCKED_BYTES = 1_000_000
 
 def judge(facts: Facts) -> list[Finding]:
     """Return the findings, in the order in which a person would go about them."""
-    return [
-        *_rights(facts),
-        *_units(facts),
-        *_bus(facts),
-        *_security(facts),
-        *_clock(facts),
-        *_memory(facts),
-        *_disk(facts),
-        *_camera(facts),
-    ]
+    found = [*_rights(facts), *_units(facts), *_bus(facts), *_security(facts), *_clock(facts)]
+    return found if facts.station else [*found, *_memory(facts), *_disk(facts), *_camera(facts)]
 
 
 def _rights(f: Facts) -> list[Finding]:
@@ -45,18 +37,24 @@ def _units(f: Facts) -> list[Finding]:
         return [Finding("units", "fail", words, f"journalctl -u {first} -n 50; then systemctl restart {first}")]
     active = sum(state == "active" for state in f.units.values())
     if not active:
-        return [Finding("units", "warn", "all units are stopped", "sudo systemctl start treedock.target")]
+        return [Finding("units", "warn", "all units are stopped", _start(f))]
     return [Finding("units", "ok", f"{active} of {len(f.units)} active")]
 
 
 def _bus(f: Facts) -> list[Finding]:
     if f.router is None:
         do = "systemctl status treedock-router, or start `treedock run`; is router.host right?"
+        if f.station:
+            do = "is the aircraft on, and the link? is router.host in /etc/treedock the aircraft's address?"
         return [Finding("router", "fail", f.router_fault or f"nobody answers at {f.wanted_router}", do)]
     found = [Finding("router", "ok", f.router), *aboard(f.services, f.vehicle, f.version)]
     if not f.services:
-        found.append(Finding("services", "warn", "no service is up", "sudo systemctl start treedock.target"))
+        found.append(Finding("services", "warn", "no service is up", _start(f)))
     return found
+
+
+def _start(f: Facts) -> str:
+    return f"sudo systemctl start treedock{'-station' if f.station else ''}.target"
 
 
 def _security(f: Facts) -> list[Finding]:

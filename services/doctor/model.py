@@ -73,6 +73,8 @@ class Facts:
     """Of the treedock that asks."""
     units: Mapping[str, str] = field(default_factory=dict)
     """Unit name to systemd's ActiveState; empty when none is installed."""
+    station: bool = False
+    """This machine is a ground station and no aircraft: it has no camera, passes no frames on and records nothing."""
     certificates: Mapping[str, float] = field(default_factory=dict)
     """Identity to days of validity left."""
     loose_keys: Sequence[str] = ()

@@ -141,6 +141,56 @@ def test_each_trouble_has_its_finding_and_what_to_do(facts: Facts, about: str, l
     assert found[0].do
 
 
+STATION = replace(
+    ENCRYPTED, station=True, services=(SLAM,), camera=None, source="realsense", disk_free_bytes=10**7, shm_free_bytes=10**7,
+    units={"treedock-station.service": "active"},
+)  # fmt: skip
+
+
+def test_a_station_is_not_asked_for_a_camera_or_a_disk_to_record_on() -> None:
+    assert {finding.level for finding in judge(STATION)} == {"ok"}
+    about = {finding.about for finding in judge(STATION)}
+    assert about.isdisjoint({"camera", "calibration", "disk", "recordings", "shared memory"})
+    assert {f.about for f in judge(replace(STATION, station=False)) if f.level == "fail"} >= {"camera", "disk"}
+
+
+@pytest.mark.parametrize(
+    ("facts", "about", "do"),
+    [
+        (replace(STATION, units={"treedock-station.service": "inactive"}), "units", "start treedock-station.target"),
+        (replace(STATION, services=()), "services", "start treedock-station.target"),
+        (replace(STATION, router=None, router_fault="nobody answers"), "router", "router.host"),
+    ],
+)
+def test_a_station_is_told_what_to_do_on_a_station(facts: Facts, about: str, do: str) -> None:
+    (finding,) = [f for f in judge(facts) if f.about == about]
+    assert do in finding.do
+    assert "treedock.target" not in finding.do
+
+
+@pytest.mark.parametrize(
+    ("identity", "enabled", "station"),
+    [
+        ("", ("disabled", "enabled"), True),
+        ("", ("enabled", "enabled"), False),
+        ("", ("enabled", "disabled"), False),
+        ("", (), False),
+        ("station.alice", (), True),
+        ("uav1.all", ("disabled", "enabled"), False),
+    ],
+)
+def test_a_machine_is_a_station_by_its_certificate_or_by_what_it_starts(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, identity: str, enabled: tuple[str, ...], station: bool
+) -> None:
+    systemctl = tmp_path / "systemctl"
+    words = "".join(f"echo {word}\n" for word in enabled)
+    systemctl.write_text(f'#!/bin/sh\n[ "$1" = is-enabled ] || exit 0\n{words}exit 1\n')
+    systemctl.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    config = TreedockConfig(security=SecurityConfig(identity=identity))
+    assert gather(config.model_copy(update={"router": config.router.model_copy(update={"port": 1})})).station is station
+
+
 def test_preflight_hears_of_failures_and_only_of_those() -> None:
     hot = replace(SLAM, state="degraded", note="lost", version="0.1.0+other")
     told = against_flight((CAMERA, hot), VehicleFact(connected=True, note=WRONG), "0.1.0+same")
