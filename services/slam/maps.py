@@ -73,15 +73,29 @@ class LiveMaps:
             return self._new(intrinsics, stamp_ns)
         slam = self._empty(intrinsics, _name(stamp_ns))
         why_not = take_up(self._store, slam, self._config.map_max_age_s)
+        damaged = self._tell_damage(why_not, stamp_ns)
         if why_not:
             LOG.info("a new map is begun: %s", why_not)
             return self._new(intrinsics, stamp_ns)
         self._keeper = Keeper(self._store)
         self._keeper.resume(slam)
         self._since_ns = stamp_ns
-        self._tell(f"slam was started again: looking for its place in {slam.map_id}")
+        if not damaged:
+            self._tell(f"slam was started again: looking for its place in {slam.map_id}")
         self._health.count("maps_taken_up")
         return slam
+
+    def _tell_damage(self, why_not: str, stamp_ns: int) -> bool:
+        """Tell for a while which files of the map were found damaged, and what became of it; return whether any was."""
+        assert self._store is not None
+        for path in self._store.damaged:
+            after = "the map is left and a new one begun" if why_not else "the map is put together from its keyframes"
+            text = f"{path}: is damaged; {after}"
+            LOG.warning(text)
+            self._health.count("bad_map_files")
+            self._tell_until_ns = stamp_ns + _TELL_NS
+            self._tell(text)
+        return bool(self._store.damaged)
 
     def _empty(self, intrinsics: Intrinsics, map_id: str) -> Slam:
         return Slam(intrinsics, self._config, map_id=map_id, crew=self.crew, keep_trail=False)

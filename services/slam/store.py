@@ -128,6 +128,8 @@ class Store:
         self._folder = folder
         self._most_bytes = most_bytes
         self._size = 0
+        self.damaged: list[Path] = []
+        """Files that were read and are not what was written."""
 
     @property
     def full(self) -> bool:
@@ -218,6 +220,8 @@ class Store:
                 (stamp_ns,) = _CLOCK.unpack(body)
                 log.last_ns = max(log.last_ns, stamp_ns)
                 log.taken_ns += [stamp_ns] * (kind == TAKEN)
+        if log.header is None:  # the first that is written; what is cut off at the end was being written
+            self.damaged.append(self._log)
         self._size = len(data)
         return log
 
@@ -228,6 +232,7 @@ class Store:
         except OSError:
             return {}
         if len(data) < 4 or zlib.crc32(data[4:]) != struct.unpack("<I", data[:4])[0]:
+            self.damaged.append(self._whole)
             return {}
         with np.load(BytesIO(data[4:]), allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from schemas.health import Health
+from services.evaluate.faults.chain_rows import unsaid
 from services.evaluate.faults.missions import Seen, line_of
 from services.evaluate.faults.verdict import Limits, common, faults_of, hold_within_s, summary
+from tests.examples import all_messages
 
 GOOD = Seen(
     what="kill -9 slam", state="approach", at_s=20.0, moved_m_s=0.3, noticed_s=0.0, back_s=2.0, ready_s=2.0, held_s=0.42, rest_s=1.0, way_m=0.3,
@@ -65,3 +69,19 @@ def test_the_worst_of_several_counts() -> None:
     assert summary(several)["held_s"] == 0.5
     assert summary(several)["back_s"] == 2.0
     assert "never" in line_of(replace(GOOD, back_s=1e9))
+
+
+def test_a_service_that_does_not_speak_of_its_damaged_map_is_complained_of() -> None:
+    file = [Path("map-uav1.tdmap")]
+    log = "12:00:00.000 mapper WARNING /x/map-uav1.tdmap: its header is damaged (checksum); the map begins anew\n"
+    healthy = all_messages()["treedock.health"]
+    assert isinstance(healthy, Health)
+    counted = healthy.model_copy(update={"counters": {"bad_map_files": 1}})
+    mute = healthy.model_copy(update={"counters": {}})
+    assert unsaid(log, counted, file) == []
+    assert unsaid(log.replace("WARNING", "INFO"), counted, file) == ["its log does not name map-uav1.tdmap"]
+    assert unsaid("12:00:00.000 mapper INFO ready\n", mute, file) == [
+        "its log does not name map-uav1.tdmap", "its health does not count the damaged map (bad_map_files)",
+    ]  # fmt: skip
+    assert unsaid(log, None, file) == ["its health does not count the damaged map (bad_map_files)"]
+    assert unsaid(log, counted, []) == ["it had saved no map that could be damaged"]

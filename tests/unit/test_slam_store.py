@@ -123,6 +123,7 @@ def test_a_damaged_whole_map_is_no_map(tmp_path: Path) -> None:
     data[len(data) // 2] ^= 1
     (tmp_path / "map.npz").write_bytes(bytes(data))
     assert store.read_map() == {}
+    assert store.damaged == [tmp_path / "map.npz"]
 
 
 def kept_map(folder: Path, frames: int = 16) -> Slam:
@@ -214,6 +215,36 @@ def test_a_whole_map_of_another_version_is_refused_not_fatal(tmp_path: Path) -> 
     kept_map(tmp_path, 3)
     Store(tmp_path, MOST).write_map({"numbers": np.arange(2)})
     assert "cannot be read" in taken_up(tmp_path)[1]
+
+
+@pytest.mark.parametrize(
+    ("file", "share", "taken", "word"),
+    [
+        ("keyframes.log", None, 0, "keyframes.log: is damaged; the map is left"),
+        ("map.npz", None, 1, "map.npz: is damaged; the map is put together from its keyframes"),
+        ("map.npz", 0.5, 1, "map.npz: is damaged; the map is put together from its keyframes"),
+        ("keyframes.log", 0.9, 1, ""),
+    ],
+)
+def test_damage_is_told_by_the_files_name(
+    tmp_path: Path, file: str, share: float | None, taken: int, word: str
+) -> None:
+    """Noise in either file, or a cut; a log that was cut at its end is what any kill may leave."""
+    kept_map(tmp_path)
+    data = (tmp_path / file).read_bytes()
+    noise = np.random.default_rng(1).bytes(len(data))
+    (tmp_path / file).write_bytes(noise if share is None else data[: int(share * len(data))])
+    health = HealthBook()
+    maps = LiveMaps(CONFIG, tmp_path, health)
+    slam = maps.begin(INTRINSICS, 10**12)
+    assert health.counters["bad_map_files"] == int(bool(word))
+    assert health.counters["maps_taken_up"] == taken
+    assert word in health.notes["map"]
+    views = [look(T) for T in turn_on_the_spot(16, 70.0)]
+    for step in (0, 9, 11):  # seconds; it is told for ten, whatever is tracked meanwhile
+        maps.after(slam, slam.track(10**12 + 10**9 * step, *views[0]))
+        assert bool(health.notes.get("map")) == (bool(word) and step < 10)
+    maps.end()
 
 
 def test_a_disk_that_refuses_is_told_and_slam_goes_on(tmp_path: Path) -> None:

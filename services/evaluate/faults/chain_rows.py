@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from schemas.health import Health
 from services.evaluate.faults.bench_rig import Bench
 from services.evaluate.faults.chain import SERVICES as CHAIN
+from services.evaluate.faults.chain import Chain
 from services.evaluate.faults.killing import SIGNALS
 from services.evaluate.faults.model import Result, Row
 from services.evaluate.faults.rig import Comeback, Rig
 from services.evaluate.faults.verdict import Limits
 
 _CLOCK_S = 0.02
+_SAID_WITHIN_S = 10.0
+"""Health comes once a second."""
 
 
 def rows() -> list[Row]:
@@ -32,7 +36,7 @@ def rows() -> list[Row]:
         for service in CHAIN[1:]
     ] + [
         Row("corrupt map", "chain", "slam and mapper are killed and their saved maps overwritten with noise, or cut short",
-            "both are READY within 3.5 s, say that the map was left, and poses and trees come again", _corrupt_map),
+            "both are READY within 3.5 s, name the damaged file and say what became of the map, and poses and trees come again", _corrupt_map),
         Row("clock step", "chain", "slam, and then the router, are killed and started again on a machine whose clock was set by an hour",
             "stamps go on as before within 20 ms; poses come again", _clock_step),
     ]  # fmt: skip
@@ -77,15 +81,10 @@ def faults_of_comeback(back: Comeback | None, limits: Limits) -> list[str]:
 
 def _corrupt_map(bench: Bench) -> Result:
     chain, rng = bench.chain(), bench.rng("corrupt map")
-    state = chain.rig.folder / "state"
     failed, backs, told = list[str](), list[float](), list[str]()
     for damage in ("noise", "cut short"):
         for service in ("slam", "mapper"):
-            before = chain.trees
-            assert before is not None, "the chain's start waits for trees"
-            harmed = _damage_when_dead(state, rng, damage, service)
-            back = chain.harm(service, before_restart=harmed)
-            words = faults_of_comeback(back, bench.limits) + chain.whole_again(before, 0)
+            back, words = _strike_map(chain, rng, bench.limits, damage, service)
             failed += [f"{service}, {damage}: {word}" for word in words]
             backs += [back.back_s] if back else []
             told.append(
@@ -95,17 +94,41 @@ def _corrupt_map(bench: Bench) -> Result:
     return Result(tuple(failed), {"back_s": max(backs, default=None)}, tuple(told))
 
 
-def _damage_when_dead(state: Path, rng: np.random.Generator, damage: str, service: str) -> Callable[[], None]:
-    """Return what overwrites a service's files while it is dead."""
+def _strike_map(
+    chain: Chain, rng: np.random.Generator, limits: Limits, damage: str, service: str
+) -> tuple[Comeback | None, list[str]]:
+    """Kill a service and damage its map; return how it came back, and what did not hold."""
+    before, size, files = chain.trees, chain.rig.log_size(service), list[Path]()
+    assert before is not None, "the chain's start waits for trees"
+    harm = partial(_damage_when_dead, chain.rig.folder / "state", rng, damage, service, files)
+    back = chain.harm(service, before_restart=harm)
+    words = faults_of_comeback(back, limits) + chain.whole_again(before, 0)
 
-    def harm() -> None:
-        folder = state / "slam" if service == "slam" else state
-        files = [p for p in folder.rglob("*") if p.is_file() and (service == "slam" or "slam" not in p.parts)]
-        for path in files:
-            size = path.stat().st_size
-            path.write_bytes(rng.bytes(size) if damage == "noise" else path.read_bytes()[: size // 2])
+    def silent() -> list[str]:
+        return unsaid(chain.rig.said_since(service, size), chain.rig.health.get(service), files)
 
-    return harm
+    chain.rig.until(lambda: not silent(), _SAID_WITHIN_S)
+    return back, words + silent()
+
+
+def _damage_when_dead(state: Path, rng: np.random.Generator, damage: str, service: str, files: list[Path]) -> None:
+    """Overwrite the files of a service's map while it is dead; add them to ``files``."""
+    files += sorted((state / "slam").glob("*") if service == "slam" else state.glob("map-*.tdmap"))
+    for path in files:
+        size = path.stat().st_size
+        path.write_bytes(rng.bytes(size) if damage == "noise" else path.read_bytes()[: size // 2])
+
+
+def unsaid(log: str, health: Health | None, damaged: Sequence[Path]) -> list[str]:
+    """Return what a service whose map files were ``damaged`` does not say: their name in its log, their number in its health."""
+    if not damaged:
+        return ["it had saved no map that could be damaged"]
+    words = []
+    if not any(path.name in line for line in log.splitlines() if "WARNING" in line for path in damaged):
+        words.append(f"its log does not name {' or '.join(path.name for path in damaged)}")
+    if health is None or not health.counters.get("bad_map_files"):
+        words.append("its health does not count the damaged map (bad_map_files)")
+    return words
 
 
 def _clock_step(bench: Bench) -> Result:

@@ -197,6 +197,16 @@ class Rig:
         ready_s, cpu_s = self._ready_s[self.pid(service)]
         return Comeback(service, ended_s - at_s, ready_s - ended_s, cpu_s)
 
+    def log_size(self, service: str) -> int:
+        """Return how much a service has said so far, bytes."""
+        path = self.folder / f"{service}.log"
+        return path.stat().st_size if path.exists() else 0
+
+    def said_since(self, service: str, size: int) -> str:
+        """Return what a service has said since its log had ``size`` bytes."""
+        path = self.folder / f"{service}.log"
+        return path.read_bytes()[size:].decode(errors="replace") if path.exists() else ""
+
     def said(self, service: str) -> str:
         """Return the last words of a service."""
         path = self.folder / f"{service}.log"
