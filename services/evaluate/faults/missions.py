@@ -60,6 +60,8 @@ class Seen:
     replays_refused: bool
     trees_lost: int
     armed_after: bool
+    flew: bool = True
+    """Whether the aircraft was armed when it struck or was armed after: one that stays on the ground has nothing to hold."""
     bridge_landed: str = ""
     """Why the bridge landed by itself, in its own words: a navigator that comes back then finds no mission to go on with."""
 
@@ -170,6 +172,7 @@ class Flights:
         flown = self.rig.flown
         before = self._moving_m_s()
         state, at_ns, trees, touches = flown.state, flown.now_ns, self._trees(), flown.touches
+        armed, armings = flown.armed, flown.armings
         back = harm()
         self._settle(at_ns)
         seen = Seen(
@@ -180,7 +183,7 @@ class Flights:
             words=tuple(dict.fromkeys(s.reason for s in flown.states if s.since_ns >= at_ns)),
             touches=flown.touches - touches, armings=flown.armings, starts=self.starts, replays_refused=self._replay_refused(),
             trees_lost=len(trees - self._trees()), armed_after=flown.armed,
-            bridge_landed=flown.bridge_landed(at_ns),
+            flew=armed or flown.armings > armings, bridge_landed=flown.bridge_landed(at_ns),
         )  # fmt: skip
         self._tell(line_of(seen))
         return seen

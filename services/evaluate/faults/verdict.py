@@ -63,6 +63,10 @@ def _flight(service: str, seen: Seen) -> Iterator[str]:
     within_s = hold_within_s(service, seen.state)
     if within_s is None:
         return
+    if not seen.flew:  # it may not take off any more: a mission that waits without the service would
+        if seen.end != "failed":
+            yield f"not armed in {seen.state}, and then {seen.end} instead of failed"
+        return
     if seen.held_s is None or seen.held_s > within_s + _MOMENT_S:
         yield f"held after {seen.held_s} s in {seen.state}, not within {within_s} s"
 
