@@ -27,6 +27,7 @@ def test_what_holds_is_not_complained_of() -> None:
 def test_an_aircraft_that_was_not_armed_yet_stays_on_the_ground_and_has_nothing_to_hold() -> None:
     seen = replace(GOOD, state="take_off", held_s=None, end="failed", reason="before take-off: no pose", flew=False)
     assert list(faults_of("fusion", seen, Limits())) == []
+    assert list(faults_of("navigator", replace(seen, end="idle"), Limits())) == []
 
 
 @pytest.mark.parametrize(
@@ -41,6 +42,7 @@ def test_an_aircraft_that_was_not_armed_yet_stays_on_the_ground_and_has_nothing_
         ({"end": "idle", "bridge_landed": "no guidance: landing", "armed_after": True}, "neither went on nor ended"),
         ({"state": "take_off", "held_s": None, "end": "failed"}, "held after None"),
         ({"state": "take_off", "held_s": None, "flew": False}, "landed instead of failed"),
+        ({"state": "take_off", "held_s": None, "flew": False, "end": "idle", "armed_after": True}, "neither went on nor ended"),
     ],
 )  # fmt: skip
 def test_whatever_does_not_hold_is_named(change: dict[str, object], word: str) -> None:

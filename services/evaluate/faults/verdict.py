@@ -53,7 +53,7 @@ def common(seen: Seen) -> Iterator[str]:
         yield f"the mission ended ({seen.end}) without a reason"
     if seen.end in ENDED and seen.armed_after:
         yield f"the mission ended ({seen.end}) with the aircraft armed"
-    ended_by_bridge = seen.end == "idle" and seen.bridge_landed and not seen.armed_after
+    ended_by_bridge = seen.end == "idle" and (seen.bridge_landed or not seen.flew) and not seen.armed_after
     if seen.end not in ENDED and seen.end not in _MOVING | {"landing"} and not ended_by_bridge:
         yield f"the mission neither went on nor ended: {seen.end or 'no word'}, {seen.reason}"
 
@@ -63,8 +63,8 @@ def _flight(service: str, seen: Seen) -> Iterator[str]:
     within_s = hold_within_s(service, seen.state)
     if within_s is None:
         return
-    if not seen.flew:  # it may not take off any more: a mission that waits without the service would
-        if seen.end != "failed":
+    if not seen.flew:  # it stays on the ground: failed, or forgotten by a navigator that begins anew
+        if seen.end not in {"failed", "idle"}:
             yield f"not armed in {seen.state}, and then {seen.end} instead of failed"
         return
     if seen.held_s is None or seen.held_s > within_s + _MOMENT_S:
