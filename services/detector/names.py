@@ -132,13 +132,15 @@ class NamesKeeper:
         saved = self._file.read(unpack)
         return saved if saved is not None and saved.boot == boot_id() else None
 
-    def keep(self, names: SavedNames, now_ns: int, *, at_once: bool = False) -> None:
-        """Write ``names``: at once when a tree came, went or the map is another, else now and then."""
-        content = names.map_id, tuple(t.id for t in names.trees)
-        if content == self._content and now_ns < self._due_ns and not at_once:
-            return
+    def due(self, map_id: str, trees: Sequence[TrackedTree], now_ns: int) -> bool:
+        """Return whether to write: at once when a tree came, went or the map is another, else now and then."""
+        return (map_id, tuple(t.tree_id for t in trees)) != self._content or now_ns >= self._due_ns
+
+    def keep(self, names: SavedNames, now_ns: int) -> None:
+        """Write ``names``."""
         fault = self._file.write([pack(names)], lasting=False)
-        self._content, self._due_ns = content, now_ns + (_AGAIN_NS if fault else _EVERY_NS)
+        self._content = names.map_id, tuple(t.id for t in names.trees)
+        self._due_ns = now_ns + (_AGAIN_NS if fault else _EVERY_NS)
         self._file.tell_written(fault)
 
 
@@ -160,9 +162,8 @@ class TakingUp:
         A tree then stays only if its place in the present map is known: the map has not changed, or an anchor tells how.
         """
         poses, anchors = store.poses(), identities.anchors.keys()
-        whole = store.complete and 2 * len(anchors & poses.keys()) >= len(
-            anchors
-        )  # the mapper may have thinned some away
+        back = len(anchors & poses.keys())
+        whole = store.complete and 2 * back >= len(anchors)  # the mapper may have thinned some away
         if not whole and now_ns - self.since_ns < patience_s * 1e9:
             return False
         gone = []

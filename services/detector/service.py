@@ -194,12 +194,14 @@ class DetectorService:
         """Keep what the next run has to know, unless this one has not taken up the last one's yet."""
         if self._keeper is None or self._published is None or self._taking_up is not None:
             return
-        ids = self._identities
+        ids, map_id, now_ns = self._identities, self._store.map_id, self._context.clock.now_ns()
+        if not at_once and not self._keeper.due(map_id, ids.trees, now_ns):
+            return
         names = SavedNames(
-            map_id=self._store.map_id, graph_version=self._graph_version, list_version=self._version, next_id=ids.next_id,
+            map_id=map_id, graph_version=self._graph_version, list_version=self._version, next_id=ids.next_id,
             trees=saved_trees(ids.trees),
         )  # fmt: skip
-        self._keeper.keep(names, self._context.clock.now_ns(), at_once=at_once)
+        self._keeper.keep(names, now_ns)
 
     def _news(self, old: tuple[Tree, ...], new: tuple[Tree, ...]) -> bool:
         if [t.id for t in old] != [t.id for t in new]:
