@@ -66,3 +66,9 @@ def give_way(nice: int) -> None:
     with contextlib.suppress(PermissionError):
         me = threading.get_native_id()
         os.setpriority(os.PRIO_PROCESS, me, min(os.getpriority(os.PRIO_PROCESS, me) + nice, 19))
+
+
+def give_back_memory() -> None:
+    """Give the machine back what was freed but is still held, after work that was large and seldom (glibc; else nothing happens)."""
+    with contextlib.suppress(AttributeError, OSError):
+        ctypes.CDLL(None).malloc_trim(0)

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 
 import zenoh
 
+from schemas.camera import RgbdFrame
+from schemas.topics import TOPICS, Reach
 from services.common.errors import InputError
 from services.common.memlock import lockable_bytes, too_little
 
@@ -30,6 +32,11 @@ _QUEUE_BATCHES = 16
 """Sent messages that may wait per priority, the most Zenoh allows. Of 420 small messages in bursts of seven, up to 6
 were lost per subscriber on a loaded two-core machine with the default of 2, none with 16."""
 _TELL_AFTER_S = 2.0
+_FRAME_SENDERS = frozenset(
+    topic.producer for topic in TOPICS if topic.message is RgbdFrame and topic.reach is Reach.HOST
+)
+_SMALL_POOL_BYTES = 4 * 1024 * 1024
+"""A keyframe is 0.15 MB, a submap up to 1 MB, the graph of 500 keyframes 50 KB."""
 
 
 def client_config(endpoint: str, secured: Mapping[str, object] | None = None) -> zenoh.Config:
@@ -96,13 +103,20 @@ def opened_node(
     """
     from services.security.transport import node_settings, pair_of
 
-    settings = node_settings(pair_of(config.security, config.uav, service)) | memory_settings(config)
+    settings = node_settings(pair_of(config.security, config.uav, service)) | memory_settings(config, service)
     return opened_client(config.router.endpoint, stopped, wait_s, settings)
 
 
-def memory_settings(config: TreedockConfig) -> dict[str, object]:
-    """Return what switches Zenoh's shared memory on or off."""
-    return {"transport/shared_memory/enabled": config.router.shared_memory}
+def memory_settings(config: TreedockConfig, service: str | None = None) -> dict[str, object]:
+    """Return what switches Zenoh's shared memory on or off, and how much of it a service (None: a tool, the router) sends from.
+
+    Whoever sends raw frames keeps Zenoh's own 16 MB, ten frames; for all others it would be memory that stays locked and is never used.
+    What does not fit goes over the socket.
+    """
+    settings: dict[str, object] = {"transport/shared_memory/enabled": config.router.shared_memory}
+    if service is not None and service not in _FRAME_SENDERS:
+        settings["transport/shared_memory/transport_optimization/pool_size"] = _SMALL_POOL_BYTES
+    return settings
 
 
 @contextmanager

@@ -1,9 +1,17 @@
-"""Owns the map's arrays (``links``): hands out slots and grows them."""
+"""Owns the map's arrays (``links``): hands out slots and grows them.
+
+Room for a long flight is reserved at once, in pages that the machine gives only when they are first written: growing is
+taking a longer part of it. Arrays that doubled were both there while one was copied into the other, and what the old one
+left behind stayed with the process.
+"""
 
 from __future__ import annotations
 
+import mmap
+from typing import TypeVar
+
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from services.slam.features import Features
 from services.slam.links import MAX_OBSERVATIONS, Keyframes, Points, observe_all, shared_counts
@@ -12,39 +20,63 @@ F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 
 
+T = TypeVar("T", Points, Keyframes)
+
+_POINTS, _KEYFRAMES = 1 << 18, 1 << 10
+"""Reserved at first; a larger map is copied into twice the room."""
+_FIRST_POINTS, _FIRST_KEYFRAMES = 4096, 16
+
+
+def _zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray:
+    """Return zeros whose memory is taken from the machine page by page as it is written, and given back with them."""
+    kind = np.dtype(dtype)
+    room = mmap.mmap(-1, int(np.prod(shape)) * kind.itemsize, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    return np.frombuffer(room, kind).reshape(shape)
+
+
 def _points(n: int) -> Points:
-    m = MAX_OBSERVATIONS
+    m, i16, i32, f64 = MAX_OBSERVATIONS, np.int16, np.int32, np.float64
     return Points(
-        np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n), np.zeros(n), np.zeros((n, 4), np.uint64),
-        np.zeros((n, m), np.int32), np.zeros((n, m), np.int32), np.zeros(n, np.int32), np.zeros(n, np.int32),
-        np.zeros(n, np.int32), np.zeros(n, np.int32), np.full(n, -1.0),
+        _zeros((n, 3), f64), _zeros((n, 3), f64), _zeros((n,), f64), _zeros((n,), f64), _zeros((n, 4), np.uint64),
+        _zeros((n, m), i16), _zeros((n, m), i16), _zeros((n,), i32), _zeros((n,), i32), _zeros((n,), i32),
+        _zeros((n,), i32), _zeros((n,), f64),
     )  # fmt: skip
 
 
 def _keyframes(k: int, n: int, cells: int) -> Keyframes:
-    f32, i32 = np.float32, np.int32
+    f32, i32, f64 = np.float32, np.int32, np.float64
     return Keyframes(
-        np.zeros((k, 3, 3)), np.zeros((k, 3)), np.zeros((k, n, 2), f32), np.zeros((k, n), f32), np.zeros((k, n), f32),
-        np.zeros((k, n), np.bool_), np.zeros((k, n), f32),
-        np.zeros((k, n), i32), np.zeros((k, n), f32), np.zeros((k, n, 4), np.uint64), np.full((k, n), -1, i32),
-        np.zeros(k, i32), np.full(k, -1, i32), np.zeros((k, cells + 1), i32), np.zeros((k, n), i32),
+        _zeros((k, 3, 3), f64), _zeros((k, 3), f64), _zeros((k, n, 2), f32), _zeros((k, n), f32), _zeros((k, n), f32),
+        _zeros((k, n), np.bool_), _zeros((k, n), f32),
+        _zeros((k, n), i32), _zeros((k, n), f32), _zeros((k, n, 4), np.uint64), _zeros((k, n), i32),
+        _zeros((k,), i32), _zeros((k,), i32), _zeros((k, cells + 1), i32), _zeros((k, n), i32),
     )  # fmt: skip
 
 
-def copy_over(grown: Points | Keyframes, old: Points | Keyframes) -> None:
-    """Copy all arrays of ``old`` into the beginnings of those of ``grown``."""
-    new_arrays: tuple[NDArray, ...] = tuple(grown)
+def _first(room: T, n: int) -> T:
+    """Return the first ``n`` rows of all arrays."""
+    arrays: tuple[NDArray, ...] = tuple(room)
+    return type(room)._make(array[:n] for array in arrays)
+
+
+def _copied(old: T, room: T) -> T:
+    """Return ``room`` with ``old`` in its beginning."""
+    new_arrays: tuple[NDArray, ...] = tuple(room)
     old_arrays: tuple[NDArray, ...] = tuple(old)
-    for a, b in zip(new_arrays, old_arrays, strict=True):
-        a[: len(b)] = b
+    for new, array in zip(new_arrays, old_arrays, strict=True):
+        new[: len(array)] = array
+    return room
 
 
 class Atlas:
     """Owns the arrays, hands out slots and grows."""
 
     def __init__(self, features: int, cells: int, scale: float, levels: int) -> None:
-        self.points = _points(4096)
-        self.keyframes = _keyframes(16, features, cells)
+        self._point_room, self._keyframe_room = _points(_POINTS), _keyframes(_KEYFRAMES, features, cells)
+        self.points = _first(self._point_room, _FIRST_POINTS)
+        self.keyframes = _first(self._keyframe_room, _FIRST_KEYFRAMES)
+        self.points.parallax[:] = -1.0
+        self.keyframes.serial[:] = -1
         self.scales = scale ** np.arange(levels, dtype=float)
         self._features = features
         self._cells = cells
@@ -69,22 +101,30 @@ class Atlas:
         """Return ``count`` free point slots, lowest first; they stay free until observed."""
         free = np.flatnonzero(self.points.n == 0)
         if len(free) < count:
-            old = self.points
-            grown = _points(2 * len(old.n) + count)
-            copy_over(grown, old)
-            self.points = grown
-            free = np.flatnonzero(grown.n == 0)
+            self._grow_points(2 * len(self.points.n) + count)
+            free = np.flatnonzero(self.points.n == 0)
         return free[:count].astype(np.int32)
+
+    def _grow_points(self, n: int) -> None:
+        old = self.points
+        if n > len(self._point_room.n):
+            self._point_room = _copied(old, _points(2 * n))
+        self.points = _first(self._point_room, n)
+        self.points.parallax[len(old.n) :] = -1.0
+
+    def _grow_keyframes(self, k: int) -> None:
+        old = self.keyframes
+        if k > len(self._keyframe_room.n):
+            self._keyframe_room = _copied(old, _keyframes(2 * k, self._features, self._cells))
+        self.keyframes = _first(self._keyframe_room, k)
+        self.keyframes.serial[len(old.n) :] = -1
 
     def add_keyframe(self, features: Features, R: F64, t: F64, point: I32) -> int:
         """Store a keyframe seen from ``R``, ``t`` (camera from map) whose features see ``point``; return its slot."""
         free = np.flatnonzero(self.keyframes.n == 0)
         if not len(free):
-            old = self.keyframes
-            grown = _keyframes(2 * len(old.n), self._features, self._cells)
-            copy_over(grown, old)
-            self.keyframes = grown
-            free = np.flatnonzero(grown.n == 0)
+            self._grow_keyframes(2 * len(self.keyframes.n))
+            free = np.flatnonzero(self.keyframes.n == 0)
         k, n, kf = int(free[0]), len(features), self.keyframes
         kf.R[k], kf.t[k], kf.n[k], kf.serial[k] = R, t, n, self._serial
         still = features.moving_s == 0.0  # what moves makes no points

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from services.slam.binary import hamming
 
 F64 = NDArray[np.float64]
+I16 = NDArray[np.int16]
 I32 = NDArray[np.int32]
 
 MAX_OBSERVATIONS = 48
@@ -32,9 +33,9 @@ class Points(NamedTuple):
     far: F64
     """Distances between which its octaves can see it."""
     desc: NDArray[np.uint64]
-    frame: I32
-    """(P, MAX_OBSERVATIONS) keyframe slots."""
-    feature: I32
+    frame: I16
+    """(P, MAX_OBSERVATIONS) keyframe slots; most points are seen by a few: two bytes each, for there are many."""
+    feature: I16
     n: I32
     """(P,) observations; 0 is a free slot."""
     found: I32
@@ -139,7 +140,7 @@ def merge(points: Points, kf: Keyframes, keep: int, drop: int, scales: F64) -> N
     found, visible = points.found[drop], points.visible[drop]
     remove_point(points, kf, drop)
     for j in range(n):
-        observe(points, kf, keep, frames[j], features[j])
+        observe(points, kf, keep, int(frames[j]), int(features[j]))
     points.found[keep] += found
     points.visible[keep] += visible
     describe(points, kf, keep, scales)

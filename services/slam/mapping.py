@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from schemas.slam import GraphReason
 from services.common.geometry import inverse, orthonormal, pose
+from services.common.process import give_back_memory
 from services.slam.atlas import Atlas, neighbours
 from services.slam.bundle import Problem, adjust, adjust_large, build, chi_squares, disparity_residuals
 from services.slam.camera import CameraModel
@@ -226,6 +227,7 @@ class Mapping:
                 adjust(problem, camera, part.free, rounds, robust)
             else:
                 adjust_large(problem, camera, part.free, rounds, robust, self.hurried)
+                give_back_memory()
                 if self.hurried():  # what was reached is taken, but not yet fit to say what does not fit
                     problem.use[:] = True
                     self.owe()

@@ -14,7 +14,8 @@ from schemas.slam import Keyframe, Pose
 from schemas.topics import CAMERA_RGBD, SIM_CLOCK, SLAM_KEYFRAME, SLAM_POSE, TREES_LIST
 from schemas.trees import TreeList
 from services.common.bus import Bus
-from services.common.session import shared_memory_note
+from services.common.config import TreedockConfig
+from services.common.session import memory_settings, opened_node, shared_memory_note
 from tests.process.conftest import HealthWatch, System, pump, stop_time_s, until
 from tests.process.nodes import KEYFRAMES, tree_list
 
@@ -45,6 +46,34 @@ def test_frames_come_through_shared_memory(routed: System) -> None:
 
         assert until(look)
         assert all(shared[2:])
+
+
+@pytest.mark.parametrize("size", [150_000, 3_900_000, 9_000_000])
+def test_what_does_not_fit_into_a_services_shared_memory_comes_all_the_same(routed: System, size: int) -> None:
+    base = TreedockConfig()
+    config = base.model_copy(update={"router": base.router.model_copy(update={"port": routed.port})})
+    assert "transport/shared_memory/transport_optimization/pool_size" in memory_settings(config, "slam")
+    got: list[bytes] = []
+    with (
+        opened_node(config, "mapper", lambda: False, 60.0) as to,
+        opened_node(config, "slam", lambda: False, 60.0) as of,
+    ):
+        subscriber = to.declare_subscriber("test/large", lambda sample: got.append(bytes(sample.payload)))
+        publisher = of.declare_publisher("test/large", congestion_control=zenoh.CongestionControl.BLOCK)
+        assert until(lambda: bool(getattr(publisher.matching_status, "matching", publisher.matching_status)))
+        sent = [bytes([number]) * size for number in range(3)]
+        for payload in sent:
+            publisher.put(payload)
+        assert until(lambda: len(got) == len(sent))
+        assert got == sent
+        subscriber.undeclare()
+
+
+def test_who_sends_raw_frames_keeps_room_for_them() -> None:
+    size = "transport/shared_memory/transport_optimization/pool_size"
+    config = TreedockConfig()
+    assert all(size not in memory_settings(config, name) for name in ("camera", "second_camera", "simulator", None))
+    assert all(size in memory_settings(config, name) for name in ("slam", "mapper", "detector", "refiner", "navigator"))
 
 
 def test_a_late_joiner_gets_the_last_list_and_the_cached_keyframes(routed: System) -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+import sys
 import types
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from numba.core.dispatcher import Dispatcher
@@ -68,3 +70,22 @@ def _words(code: types.CodeType) -> Iterator[str]:
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):
             yield from _words(constant)
+
+
+def test_python_is_compiled_where_it_may_not_write_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    for package in ("schemas", "services"):
+        (tmp_path / package).mkdir()
+        (tmp_path / package / "module.py").write_text("VALUE = 1\n")
+    assert warm.compile_python(tmp_path)
+    assert all(list((tmp_path / package / "__pycache__").glob("module.*.pyc")) for package in ("schemas", "services"))
+
+
+def test_a_module_that_cannot_be_compiled_is_told_of_by_the_result_alone(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "schemas").mkdir()
+    (tmp_path / "services").mkdir()
+    (tmp_path / "services" / "module.py").write_text("def\n")
+    assert not warm.compile_python(tmp_path)
+    assert capfd.readouterr() == ("", "")
