@@ -25,7 +25,7 @@ _CROWDED, _SPARSE = 8, 4
 _POOR = 0.5
 """Share of the corners wanted below which an image is searched again with its contrast stretched."""
 _STRETCH_BLUR_PX = 1.5
-_STRETCH_LEVEL = 3
+STRETCH_LEVEL = 3
 """The finest level searched in a stretched image: what is smaller is blurred away, and its corners lie where noise put them."""
 _STRETCH_TO, _STRETCH_LEAST, _STRETCH_MOST = 40.0, 2.0, 8.0
 """The standard deviation of grey values that the stretched image has, and how much it is stretched at least and at most."""
@@ -134,8 +134,8 @@ def orient(image: U8, xy: F32) -> F64:
     return out
 
 
-def stretch(image: U8) -> U8 | None:
-    """Return a flat image with more contrast: fog, dusk, a bare wall; None for one that is not flat.
+def stretch(image: U8, least: float = _STRETCH_LEAST) -> U8 | None:
+    """Return a flat image with more contrast: fog, dusk, a bare wall; None for one that is not flat (has ``least`` to gain).
 
     Blurred first, or the sensor's noise would make the corners. An image smeared by motion has contrast and few corners: more
     of them would lie where the smear put them.
@@ -145,7 +145,7 @@ def stretch(image: U8) -> U8 | None:
     soft = cv2.GaussianBlur(image.astype(np.float32), (0, 0), _STRETCH_BLUR_PX)
     mean, deviation = (float(value[0, 0]) for value in cv2.meanStdDev(soft))
     gain = min(_STRETCH_TO / max(deviation, 1e-6), _STRETCH_MOST)
-    if gain < _STRETCH_LEAST:
+    if gain < least:
         return None
     return np.clip(128.0 + gain * (soft - mean), 0.0, 255.0).astype(np.uint8)
 
@@ -165,15 +165,23 @@ class Detector:
         import cv2
 
         shares = scale ** -np.arange(levels, dtype=float)
-        self._quota = np.round(corners * shares / shares.sum()).astype(int)
-        coarse = np.where(np.arange(levels) >= min(_STRETCH_LEVEL, levels - 1), shares, 0.0)
-        self._coarse = np.floor(corners * coarse / coarse.sum()).astype(int)
-        self._scales = scale ** np.arange(levels, dtype=float)
+        self.quota = np.round(corners * shares / shares.sum()).astype(int)
+        coarse = np.where(np.arange(levels) >= min(STRETCH_LEVEL, levels - 1), shares, 0.0)
+        self.coarse = np.floor(corners * coarse / coarse.sum()).astype(int)
+        """Corners wanted of each level of a stretched image."""
+        self.scales = scale ** np.arange(levels, dtype=float)
         self._lowest = lowest
         self._threshold = [start] * levels
         make_fast: Any = cv2.FastFeatureDetector_create  # type: ignore[attr-defined]  # missing from the stubs
         self._places_of: Any = cv2.KeyPoint_convert  # type: ignore[attr-defined]
         self._fast: list[Any] = [make_fast(start) for _ in range(levels)]
+
+    def whole_places(self, image: U8, xy: F64, octave: NDArray[np.int32]) -> F64:
+        """Return places (N, 2) of the image as ``detect`` gives them to OpenCV: whole pixels of the level times its scale."""
+        size = np.array([image.shape[1], image.shape[0]])
+        scale = self.scales[octave][:, None]
+        ratio = size / np.round(size / scale)
+        return np.asarray(np.round((xy + 0.5) / ratio - 0.5) * scale)
 
     def pyramid(self, image: U8) -> list[U8]:
         """Return the image at all scales, full size first."""
@@ -181,7 +189,7 @@ class Detector:
 
         out = [image]
         height, width = image.shape
-        for s in self._scales[1:]:
+        for s in self.scales[1:]:
             size = (round(width / s), round(height / s))
             out.append(cv2.resize(out[-1], size, interpolation=cv2.INTER_LINEAR).astype(np.uint8, copy=False))
         return out
@@ -192,23 +200,23 @@ class Detector:
         Places (N, 2) in the full size image, the same by OpenCV's reckoning (whole pixels of the level times its scale),
         directions (N,) and octaves (N,).
         """
-        found = self._search(image, depth_m, self._quota)
-        if len(found[0]) >= _POOR * self._quota.sum():
+        found = self._search(image, depth_m, self.quota)
+        if len(found[0]) >= _POOR * self.quota.sum():
             return image, found
         stretched = stretch(image)
-        return (image, found) if stretched is None else (stretched, self._search(stretched, depth_m, self._coarse))
+        return (image, found) if stretched is None else (stretched, self._search(stretched, depth_m, self.coarse))
 
     def _search(self, image: U8, depth_m: F32, quota: I64) -> tuple[F64, F64, F64, NDArray[np.int32]]:
         """Return up to ``quota`` (levels,) corners of each level."""
         places, whole, angles, octaves = [], [], [], []
         for level, small in enumerate(self.pyramid(image)):
             xy = self._candidates(level, small)
-            strength = rate(small, xy, depth_m, self._scales[level])
+            strength = rate(small, xy, depth_m, self.scales[level])
             chosen = xy[spread(xy, strength, quota[level], small.shape[1], small.shape[0])]
             exact = np.empty((len(chosen), 2))
             place(small, chosen, exact)
             places.append((exact + 0.5) * _ratio(image, small) - 0.5)
-            whole.append(chosen * self._scales[level])
+            whole.append(chosen * self.scales[level])
             angles.append(orient(small, chosen))
             octaves.append(np.full(len(chosen), level, np.int32))
         return np.concatenate(places), np.concatenate(whole), np.concatenate(angles), np.concatenate(octaves)
@@ -217,13 +225,13 @@ class Detector:
         """Return the FAST corners (N, 2) of a level, and adapt its threshold to their number."""
         found = self._fast[level].detect(small)
         threshold = self._threshold[level]
-        if len(found) < self._quota[level] and threshold > self._lowest:  # a sudden want of texture does not wait
+        if len(found) < self.quota[level] and threshold > self._lowest:  # a sudden want of texture does not wait
             threshold = self._lowest
             self._fast[level].setThreshold(threshold)
             found = self._fast[level].detect(small)
-        if len(found) < _SPARSE * self._quota[level]:
+        if len(found) < _SPARSE * self.quota[level]:
             threshold = max(threshold - 3, self._lowest)
-        elif len(found) > _CROWDED * self._quota[level]:
+        elif len(found) > _CROWDED * self.quota[level]:
             threshold = min(threshold + 1, 80)
         if threshold != self._threshold[level]:
             self._threshold[level] = threshold

@@ -13,6 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from schemas.camera import Intrinsics
+from services.slam.carry import Carrier
 from services.slam.config import SlamConfig
 from services.slam.depth_noise import DepthNoise
 from services.slam.detect import EDGE_PX, Detector
@@ -188,14 +189,17 @@ class Extractor:
         self._K = np.array([[intrinsics.fx, 0.0, intrinsics.cx], [0.0, intrinsics.fy, intrinsics.cy], [0.0, 0.0, 1.0]])
         self._distortion = np.array([intrinsics.k1, intrinsics.k2, intrinsics.p1, intrinsics.p2, intrinsics.k3])
         self._cols, self._rows = grid_size(intrinsics)
+        self._carrier = Carrier(self._detector)
         self._sharpness = Sharpness()
 
     def extract(self, grey: U8, depth_m: NDArray[np.float32]) -> Features:
         """Return the features of an image (H, W) with its depth (H, W)."""
         smeared, grey = self._sharpness.judge(grey)
-        searched, (xy, whole, angle, octave) = self._detector.detect(grey, depth_m)
+        searched, found = self._detector.detect(grey, depth_m)
+        xy, whole, angle, octave = self._carrier.join(grey, searched, found)
         desc, kept = self._describe(searched, whole, angle, octave)
         xy, angle, octave = xy[kept], angle[kept], octave[kept]
+        self._carrier.keep(grey, searched, xy, angle, octave)
         depth, info, far = sample_depth(
             depth_m, xy, self._config.min_depth_m, DEPTH_REACH * self._config.max_depth_m, self._bf, self.depth_noise.sigma_px
         )  # fmt: skip
