@@ -32,6 +32,8 @@ _RATE_HZ = 15.0
 _SAME_M = 0.05
 _READY_WITHIN_S = 300.0
 _SEEN_WITHIN_S = 90.0
+_STAYS_S = 4.0
+"""Longer than the mapper takes to tell what it holds, twice, and the detector to draw its conclusions."""
 
 
 @dataclass
@@ -104,19 +106,40 @@ class Chain:
         before_restart()  # the supervisor looks again only when this is done
         return self.rig.comeback(service, pid, at_s, patience_s)
 
+    def known(self) -> TreeList:
+        """Return the list, waited for: what was lost in a fault before may still be on its way.
+
+        Raises:
+            InputError: there is none.
+        """
+        self.rig.until(lambda: self.trees is not None, _SEEN_WITHIN_S)
+        found = self.trees
+        if found is None:
+            raise InputError(f"no tree in the list for {_SEEN_WITHIN_S:.0f} s: see {self.rig.folder}")
+        return found
+
     def whole_again(self, before: TreeList, since_ns: int) -> list[str]:
-        """Wait until poses come and every tree known before is known again; return what is missing."""
+        """Wait until poses come and every tree known before is known again, and stays; return what is missing.
+
+        A list of the poses' own map, and still so after some seconds: the last one stands until somebody says otherwise.
+        """
         self.poses.clear()
+        end_s = time.monotonic() + _SEEN_WITHIN_S
         missing = [tree.id for tree in before.trees]
 
         def whole() -> bool:
             nonlocal missing
             now = self.trees
-            missing = lost(before, now) if now is not None and now.stamp_ns >= since_ns else missing
-            return not missing and self.located_since(0) >= 15
+            missing = (
+                lost(before, now) if now is not None and now.stamp_ns >= since_ns else [t.id for t in before.trees]
+            )
+            ours = now is not None and bool(self.poses) and now.map_id == self.poses[-1].map_id
+            return ours and not missing and self.located_since(0) >= 15
 
-        if self.rig.until(whole, _SEEN_WITHIN_S):
-            return []
+        while self.rig.until(whole, max(0.0, end_s - time.monotonic())):
+            self.rig.pump(_STAYS_S)
+            if whole():
+                return []
         words = [f"tree {number} is lost" for number in missing]
         return words + ["no pose any more"] * (self.located_since(0) < 15)
 

@@ -47,8 +47,7 @@ def _strike_real(bench: Bench, service: str, how: str) -> Result:
     failed, told, backs, noticed, ready = [], [], [], [], []
     for _ in range(bench.moments):
         chain.rig.pump(float(rng.uniform(0.5, 6.0)))
-        before = chain.trees
-        assert before is not None, "the chain's start waits for trees"
+        before = chain.known()
         since_ns = time.time_ns()
         back = chain.harm(service, SIGNALS[how])
         words = faults_of_comeback(back, bench.limits) + chain.whole_again(
@@ -98,8 +97,7 @@ def _strike_map(
     chain: Chain, rng: np.random.Generator, limits: Limits, damage: str, service: str
 ) -> tuple[Comeback | None, list[str]]:
     """Kill a service and damage its map; return how it came back, and what did not hold."""
-    before, size, files = chain.trees, chain.rig.log_size(service), list[Path]()
-    assert before is not None, "the chain's start waits for trees"
+    before, size, files = chain.known(), chain.rig.log_size(service), list[Path]()
     harm = partial(_damage_when_dead, chain.rig.folder / "state", rng, damage, service, files)
     back = chain.harm(service, before_restart=harm)
     words = faults_of_comeback(back, limits) + chain.whole_again(before, 0)
@@ -135,8 +133,7 @@ def _clock_step(bench: Bench) -> Result:
     chain = bench.chain()
     rig, failed, told, worst = chain.rig, list[str](), list[str](), 0.0
     for service in ("slam", "router"):
-        before = chain.trees
-        assert before is not None, "the chain's start waits for trees"
+        before = chain.known()
         path = rig.config_file(service)
         values = json.loads(path.read_text(encoding="utf-8"))
         path.write_text(json.dumps({**values, "clock_ahead_s": values["clock_ahead_s"] + 3600.0}), encoding="utf-8")
