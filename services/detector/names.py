@@ -77,7 +77,11 @@ class SavedNames(BaseModel):
 
 def pack(names: SavedNames) -> bytes:
     """Return the file: a line with the checksum, then JSON."""
-    body = names.model_dump_json().encode()
+    return framed(names.model_dump_json().encode())
+
+
+def framed(body: bytes) -> bytes:
+    """Return the bytes of a file around its JSON."""
     return _MAGIC + b"%08x\n" % zlib.crc32(body) + body
 
 

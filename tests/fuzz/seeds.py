@@ -18,12 +18,16 @@ from services.camera.codecs import encode_colour, encode_depth
 from services.camera.sources.mcap_file import FrameWriter
 from services.common.config import TreedockConfig
 from services.common.config_loader import to_toml
+from services.detector.identity import TrackedTree
+from services.detector.map_store import Anchor
+from services.detector.names import SavedNames, saved_trees
 from services.evaluate.exports import ply_bytes
 from services.mapper.saved_map import pack
 from services.security.register import Issued, Register
 from services.slam.store import BEAT, HEADER, KEYFRAME, encode_keyframe, record
 from tests.camera_data import CAMERA, colour_image, depth_image, frame
 from tests.ros_bags import BagMaker, camera_messages
+from tests.unit.test_detector_identity import trunk_at
 from tests.unit.test_mapper_saved import saved
 from tests.unit.test_slam_store import keyframe
 
@@ -92,6 +96,13 @@ def slam_log() -> bytes:
 
 def mapper_map() -> bytes:
     return b"".join(pack(saved(2)))
+
+
+def tree_ids() -> bytes:
+    """The JSON alone, without its checksum."""
+    trees = [TrackedTree(k, trunk_at(2.0, 0.5 * k), 3, 0, Anchor(k, np.eye(4))) for k in (1, 2)]
+    names = SavedNames(map_id="m", graph_version=3, list_version=4, next_id=3, trees=saved_trees(trees))
+    return names.model_dump_json().encode()
 
 
 @cache

@@ -21,6 +21,8 @@ from services.camera.sources.accelerometer import Accelerometer
 from services.camera.sources.camera_json import read_camera
 from services.common.config_loader import load
 from services.common.errors import InputError
+from services.detector.names import framed
+from services.detector.names import unpack as unpack_tree_ids
 from services.detector.readers import read_cloud
 from services.mapper.saved_map import SavedMapError, unpack
 from services.navigator.autopilot.bridge import Bridge
@@ -110,6 +112,11 @@ def _slam_log(data: bytes, _: Path) -> None:
         assert isinstance(body, bytes)
 
 
+def _tree_ids(data: bytes, _: Path) -> object:
+    """The checksum is put right, so that damage reaches what lies behind it."""
+    return unpack_tree_ids(framed(data)).tracked()
+
+
 def _text(data: bytes, _: Path) -> object:
     return parse(data.decode(errors="replace"))
 
@@ -177,6 +184,7 @@ TARGETS: dict[str, Target] = {
     "configuration json": Target([seeds.json_config()], _file("a.json", lambda path: load(path, environ={})), _FILE, slow=2),
     "certificates list": Target([seeds.certificates()], _file(Register.FILE, lambda path: Register.read(path.parent)), _FILE),
     "map of slam": Target([seeds.slam_log()], _slam_log, ()),
+    "tree ids": Target([seeds.tree_ids()], _tree_ids, (ValueError,)),
     "map of mapper": Target([seeds.mapper_map()], lambda data, _: unpack(data), (SavedMapError,)),
     "page request": Target(seeds.page_requests(), _text, (DecodeError,)),
 }  # fmt: skip

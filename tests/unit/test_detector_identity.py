@@ -10,7 +10,7 @@ from services.detector.map_store import anchor_of
 from services.detector.model import Trunk
 
 
-def _trunk(x: float, y: float, radius: float = 0.1) -> Trunk:
+def trunk_at(x: float, y: float, radius: float = 0.1) -> Trunk:
     return Trunk(
         base_m=(x, y, 0.0), axis=(0.0, 0.0, 1.0), radius_m=radius, radius_height_m=1.3, taper=0.0, height_seen_m=3.0,
         low_seen_m=0.3, sigma_xy_m=0.005, sigma_radius_m=0.002, arc_rad=2.0, confidence=0.9, layers=19, points=900,
@@ -24,9 +24,9 @@ def _ids(identities: Identities) -> dict[int, tuple[float, float]]:
 
 def test_ids_stay_whatever_the_order() -> None:
     ids = Identities(DetectorServiceConfig())
-    ids.update([_trunk(1, 0), _trunk(3, 0), _trunk(0, 4)])
+    ids.update([trunk_at(1, 0), trunk_at(3, 0), trunk_at(0, 4)])
     first = _ids(ids)
-    ids.update([_trunk(0.03, 4.02), _trunk(1.02, 0), _trunk(3.01, 0.02)])
+    ids.update([trunk_at(0.03, 4.02), trunk_at(1.02, 0), trunk_at(3.01, 0.02)])
     assert _ids(ids).keys() == first.keys()
     for tree_id, place in _ids(ids).items():
         assert np.hypot(place[0] - first[tree_id][0], place[1] - first[tree_id][1]) < 0.1
@@ -35,17 +35,17 @@ def test_ids_stay_whatever_the_order() -> None:
 
 def test_another_radius_is_another_tree_and_ids_are_never_used_again() -> None:
     ids = Identities(DetectorServiceConfig(forget_after=1))
-    ids.update([_trunk(1, 0, 0.05)])
-    ids.update([_trunk(1.05, 0, 0.35)])
+    ids.update([trunk_at(1, 0, 0.05)])
+    ids.update([trunk_at(1.05, 0, 0.35)])
     assert [t.tree_id for t in ids.trees] == [2]
 
 
 def test_forgotten_after_some_misses() -> None:
     ids = Identities(DetectorServiceConfig(forget_after=2))
-    ids.update([_trunk(1, 0)])
+    ids.update([trunk_at(1, 0)])
     ids.update([])
     assert [t.missed for t in ids.trees] == [1]
-    ids.update([_trunk(1, 0)])
+    ids.update([trunk_at(1, 0)])
     assert [(t.tree_id, t.missed) for t in ids.trees] == [(1, 0)]
     ids.update([])
     ids.update([])
@@ -54,8 +54,8 @@ def test_forgotten_after_some_misses() -> None:
 
 def test_close_trees_do_not_swap() -> None:
     ids = Identities(DetectorServiceConfig())
-    ids.update([_trunk(1.0, 0.0), _trunk(1.35, 0.0)])
-    ids.update([_trunk(1.40, 0.0), _trunk(1.08, 0.0)])
+    ids.update([trunk_at(1.0, 0.0), trunk_at(1.35, 0.0)])
+    ids.update([trunk_at(1.40, 0.0), trunk_at(1.08, 0.0)])
     assert _ids(ids) == {1: (1.08, 0.0), 2: (1.40, 0.0)}
 
 
@@ -67,12 +67,12 @@ def test_the_anchor_is_the_submap_that_looks_at_it() -> None:
 
 def test_ids_follow_a_map_correction() -> None:
     ids = Identities(DetectorServiceConfig())
-    ids.update([_trunk(4.0, 0.0), _trunk(4.0, 0.7)])
+    ids.update([trunk_at(4.0, 0.0), trunk_at(4.0, 0.7)])
     ids.fasten({1: level_camera([0, 0, 1.5], 0.0)})
     ids.follow({1: level_camera([0, 0, 1.5], 0.15)})  # a loop closes: everything turns by 0.15 rad, 0.6 m at 4 m
     c, s = np.cos(0.15), np.sin(0.15)
     assert _ids(ids)[2] == pytest.approx((4 * c - 0.7 * s, 4 * s + 0.7 * c))
-    ids.update([_trunk(4 * c, 4 * s), _trunk(4 * c - 0.7 * s, 4 * s + 0.7 * c)])
+    ids.update([trunk_at(4 * c, 4 * s), trunk_at(4 * c - 0.7 * s, 4 * s + 0.7 * c)])
     assert {t.tree_id: round(t.trunk.base_m[1], 2) for t in ids.trees} == {
         1: round(4 * s, 2),
         2: round(4 * s + 0.7 * c, 2),
@@ -81,7 +81,7 @@ def test_ids_follow_a_map_correction() -> None:
 
 def test_a_tree_whose_anchor_is_gone_follows_its_neighbours() -> None:
     ids = Identities(DetectorServiceConfig())
-    ids.update([_trunk(4.0, 0.0), _trunk(4.0, 0.7), _trunk(-30.0, 0.0)])
+    ids.update([trunk_at(4.0, 0.0), trunk_at(4.0, 0.7), trunk_at(-30.0, 0.0)])
     ids.fasten({1: level_camera([0, 0, 1.5], 0.0), 2: level_camera([0, 0, 1.5], 0.3)})
     assert [t.anchor and t.anchor.submap_id for t in ids.trees] == [1, 2, None]
     ids.follow({2: level_camera([0.5, 0, 1.5], 0.3)})
@@ -92,14 +92,14 @@ def test_a_tree_whose_anchor_is_gone_follows_its_neighbours() -> None:
 
 def test_what_happens_to_trees_is_told() -> None:
     ids = Identities(DetectorServiceConfig(forget_after=2))
-    assert [(e.kind, e.tree_id) for e in ids.update([_trunk(1, 0, 0.12), _trunk(1.2, 0, 0.12)])] == [
+    assert [(e.kind, e.tree_id) for e in ids.update([trunk_at(1, 0, 0.12), trunk_at(1.2, 0, 0.12)])] == [
         ("appeared", 1), ("appeared", 2),
     ]  # fmt: skip
-    (merged,) = ids.update([_trunk(1.08, 0, 0.2)])
+    (merged,) = ids.update([trunk_at(1.08, 0, 0.2)])
     assert (merged.kind, merged.tree_id, merged.other_id) == ("merged", 2, 1)
     assert [t.tree_id for t in ids.trees] == [1], "at once, not after some misses"
-    (split,) = ids.update([_trunk(1.0, 0, 0.12), _trunk(1.2, 0, 0.12)])
+    (split,) = ids.update([trunk_at(1.0, 0, 0.12), trunk_at(1.2, 0, 0.12)])
     assert (split.kind, split.tree_id, split.other_id) == ("split", 3, 1)
-    assert ids.update([_trunk(1.0, 0, 0.12)]) == [], "missed once is not gone"
-    (gone,) = ids.update([_trunk(1.0, 0, 0.12)])
+    assert ids.update([trunk_at(1.0, 0, 0.12)]) == [], "missed once is not gone"
+    (gone,) = ids.update([trunk_at(1.0, 0, 0.12)])
     assert str(gone) == "tree 3 is gone"
