@@ -46,6 +46,8 @@ class DetectorService:
         self._saved = None if self._keeper is None else self._keeper.load()
         """What the run before kept, until the first word of a map."""
         self._taking_up: TakingUp | None = None
+        self._whole = True
+        """Whether the map has been whole since trees of the run before were taken up."""
         self._incomplete = False
         self._graph_version = 0
         """Of the map at the last detection."""
@@ -121,7 +123,7 @@ class DetectorService:
         self._identities.clear()
         self._incremental.clear()
         self._fusion.clear(map_id)
-        saved, self._saved, self._taking_up = self._saved, None, None
+        saved, self._saved, self._taking_up, self._whole = self._saved, None, None, True
         if saved is not None and saved.map_id == map_id and saved.trees:
             self._identities.take_up(saved.tracked())
             self._taking_up = TakingUp(saved.graph_version, self._context.clock.now_ns())
@@ -134,7 +136,7 @@ class DetectorService:
             now_ns, patience_s = self._context.clock.now_ns(), self._config.await_map_s
             if not self._taking_up.over(self._identities, self._store, now_ns, patience_s):
                 return False
-            self._taking_up = None
+            self._taking_up, self._whole = None, False
         return True
 
     def _fetch_whole_map(self) -> None:
@@ -161,7 +163,8 @@ class DetectorService:
                 result = self._incremental.whole(points, views)
             else:
                 result = self._incremental.update(points, views, touched)
-        for event in self._identities.update(result.trunks):
+        self._whole = self._whole or self._store.complete
+        for event in self._identities.update(result.trunks, whole=self._whole):
             health.count(f"trees_{event.kind}")
             LOG.info("%s", event)
         self._identities.fasten(self._store.poses())

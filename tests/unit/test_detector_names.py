@@ -79,10 +79,16 @@ def test_half_a_map_that_stays_half_is_not_waited_for_for_ever(tmp_path: Path) -
     system = System(str(tmp_path), now_ns=9_000_000_000)
     system.send(submaps[0])
     system.rest(31.0)
-    assert 1 in places(system.lists[-1])
-    third = submap_of(tree_cloud(BESIDE), 3)
-    system.send(third)
+    assert places(system.lists[-1]) == {1: FAR, 2: NEAR}
+    for number, place in enumerate((BESIDE, (3.0, 2.2), (4.5, 0.5), (4.5, 1.8))):
+        system.send(submap_of(tree_cloud(place), 3 + number))
+    assert places(system.lists[-1])[2] == NEAR, "not withdrawn by looks at a part of the map"
     assert places(system.lists[-1])[3] == BESIDE, "the id of the tree that is not there is not given to another"
+    held = [submaps[0], *(submap_of(tree_cloud(BESIDE), 3 + number) for number in range(4))]
+    system.tell_index(*held)  # the map is whole, and has it no more
+    for version in range(2, 6):
+        system.send(submap_of(tree_cloud(BESIDE), 3, version))
+    assert 2 not in places(system.lists[-1])
 
 
 @pytest.mark.parametrize("way_m", [0.6, -0.6])
