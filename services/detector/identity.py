@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -95,10 +95,10 @@ class Identities:
         for tree in self.trees:
             tree.anchor = anchor_of(np.array(tree.trunk.base_m), poses)
 
-    def update(self, trunks: Sequence[Trunk], *, whole: bool = True) -> list[TreeEvent]:
+    def update(self, trunks: Sequence[Trunk], shown: Callable[[Floats], bool] = lambda _: True) -> list[TreeEvent]:
         """Match a whole new detection, nearest pairs first, each side once; return what happened to whom.
 
-        ``whole=False``: the map is known to be a part of what it was, and no tree is withdrawn because it is not seen.
+        ``shown`` tells whether the map shows a place (3,) at all: only there is a tree that is not seen withdrawn.
 
         Two trees that became one trunk are merged at once, under the id that fits better; a trunk that was not seen is kept
         for a few updates, because a look from elsewhere may miss it.
@@ -119,21 +119,26 @@ class Identities:
             matched.add(i)
             tree = owner[j] = self.trees[i]
             tree.trunk, tree.missed, tree.observations = trunks[j], 0, tree.observations + 1
-        events = self._lost([tree for i, tree in enumerate(self.trees) if i not in matched], trunks, owner, whole=whole)
+        events = self._lost([tree for i, tree in enumerate(self.trees) if i not in matched], trunks, owner, shown)
         events += self._begun(trunks, owner, before)
         return events
 
     def _lost(
-        self, lost: Sequence[TrackedTree], trunks: Sequence[Trunk], owner: dict[int, TrackedTree], *, whole: bool
+        self,
+        lost: Sequence[TrackedTree],
+        trunks: Sequence[Trunk],
+        owner: dict[int, TrackedTree],
+        shown: Callable[[Floats], bool],
     ) -> list[TreeEvent]:
         """Count misses; withdraw what went into another tree, or was missed too often."""
         events: list[TreeEvent] = []
         for tree in lost:
-            tree.missed = tree.missed + 1 if whole else 1
+            seen_there = shown(np.array(tree.trunk.base_m))
+            tree.missed = tree.missed + 1 if seen_there else 1
             into = next((o for j, o in owner.items() if self._distance(tree, trunks[j]) < trunks[j].radius_m), None)
             if into is not None:
                 events.append(TreeEvent("merged", tree.tree_id, into.tree_id))
-            elif whole and tree.missed >= self._config.forget_after:
+            elif seen_there and tree.missed >= self._config.forget_after:
                 events.append(TreeEvent("gone", tree.tree_id))
         withdrawn = {event.tree_id for event in events}
         self.trees = [t for t in self.trees if t.tree_id not in withdrawn]

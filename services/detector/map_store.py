@@ -14,6 +14,10 @@ from services.detector.model import Floats, Views
 
 _PATIENCE_S = (2.0, 30.0)
 """Least and longest time between two questions for the whole map."""
+_RANGE_M = 6.0
+"""As far as the mapper believes the depth image."""
+_TRUNK_M = 0.6
+"""Radius of the thickest."""
 
 
 @dataclass(slots=True)
@@ -40,7 +44,7 @@ class MapStore:
         self.changed_points = 0
         """Points that came, went or moved since ``settle``."""
         self._touched: Cells = frozenset()
-        self._epoch: int | None = None
+        self.epoch: int | None = None
         """The run of the mapper whose versions these are; None until an index told."""
         self._index: MapIndex | None = None
         """The last that was heard of this map."""
@@ -98,10 +102,10 @@ class MapStore:
         """
         if index.map_id != self.map_id:
             return False
-        if index.epoch != self._epoch:
-            if self._epoch is not None:
+        if index.epoch != self.epoch:
+            if self.epoch is not None:
                 self._drop(set(self._held))  # versions of another run of the mapper
-            self._epoch = index.epoch
+            self.epoch = index.epoch
         absent = set(self._held) - set(index.submap_ids)
         self._drop(absent & self._absent)
         self._absent = absent - self._absent
@@ -152,6 +156,19 @@ class MapStore:
         )  # fmt: skip
         return np.concatenate(points), views
 
+    def shows(self, position_m: Floats) -> bool:
+        """Return whether a camera of the map looked at a place (3,), or so near it that a trunk there would show.
+
+        From above: within its field of view and its range.
+        """
+        for held in self._held.values():
+            T = held.T_map_submap
+            level = np.array([position_m[0], position_m[1], T[2, 3]]) - T[:3, 3]
+            right, ahead = float(T[:3, 0] @ level), float(T[:3, 2] @ level)
+            if 0.3 < ahead < _RANGE_M + _TRUNK_M and abs(right) < held.tan_half[0] * ahead + _TRUNK_M:
+                return True
+        return False
+
     def poses(self) -> dict[int, Floats]:
         """Return where each submap stands."""
         return {submap_id: held.T_map_submap for submap_id, held in self._held.items()}
@@ -166,7 +183,7 @@ class Anchor:
     """(4, 4)."""
 
 
-def anchor_of(position_m: Floats, poses: Mapping[int, Floats], reach_m: float = 6.0) -> Anchor | None:
+def anchor_of(position_m: Floats, poses: Mapping[int, Floats], reach_m: float = _RANGE_M) -> Anchor | None:
     """Return the submap of ``poses`` (by id) that looks at a place (3,) most squarely, None when none does."""
     best, score = None, 0.0
     for submap_id, T in poses.items():

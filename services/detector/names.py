@@ -150,7 +150,7 @@ class NamesKeeper:
 
 @dataclass(frozen=True, slots=True)
 class TakingUp:
-    """Trees of the run before, from the first word of their map until that map is here again.
+    """Trees that are known while their map is not here, because this service or the mapper was started again.
 
     Meanwhile no list is made: half a map would withdraw trees that stand, or show under a new id what has one. Whoever
     flies keeps the last list, in which every tree stands under its id, and brakes for all of them.
@@ -159,11 +159,14 @@ class TakingUp:
     graph_version: int
     """Of the map that they were last seen in."""
     since_ns: int
+    saved: bool
+    """They come from the run before, which ended nobody knows how long ago."""
 
     def over(self, identities: Identities, store: MapStore, now_ns: int, patience_s: float) -> bool:
         """Return whether lists may be made again: the map is whole, or was waited for long enough.
 
-        A tree then stays only if its place in the present map is known: the map has not changed, or an anchor tells how.
+        A saved tree then stays only if its place in the present map is known: the map has not changed, or an anchor
+        tells how.
         """
         poses, anchors = store.poses(), identities.anchors.keys()
         back = len(anchors & poses.keys())
@@ -171,10 +174,10 @@ class TakingUp:
         if not whole and now_ns - self.since_ns < patience_s * 1e9:
             return False
         gone = []
-        if store.graph_version < self.graph_version:  # slam begins at 0: another map that bears the name of the old
-            gone = [tree.tree_id for tree in identities.trees]
+        if self.saved and store.graph_version < self.graph_version:
+            gone = [tree.tree_id for tree in identities.trees]  # another map that bears the name of the old
             identities.clear()
-        elif store.graph_version > self.graph_version:
+        elif self.saved and store.graph_version > self.graph_version:
             gone = identities.forget_unled(poses)
         LOG.info(
             "%d trees keep their ids%s; the map is %s", len(identities.trees),

@@ -47,7 +47,7 @@ class DetectorService:
         """What the run before kept, until the first word of a map."""
         self._taking_up: TakingUp | None = None
         self._whole = True
-        """Whether the map has been whole since trees of the run before were taken up."""
+        """Whether the map has been whole since known trees waited for it."""
         self._incomplete = False
         self._graph_version = 0
         """Of the map at the last detection."""
@@ -80,8 +80,11 @@ class DetectorService:
         """Notice what of the map was missed; a late joiner begins with it."""
         if not self._store.map_id:
             self._begin(index.map_id)
-        if self._store.lacks(index, self._context.clock.now_ns()):
+        epoch, now_ns = self._store.epoch, self._context.clock.now_ns()
+        if self._store.lacks(index, now_ns):
             self._incomplete = True
+        if epoch not in (None, self._store.epoch) and self._taking_up is None and self._identities.trees:
+            self._taking_up = TakingUp(self._graph_version, now_ns, saved=False)  # the mapper was started again
 
     def on_target(self, target: Target) -> None:
         """Take up what the refiner measured."""
@@ -126,12 +129,12 @@ class DetectorService:
         saved, self._saved, self._taking_up, self._whole = self._saved, None, None, True
         if saved is not None and saved.map_id == map_id and saved.trees:
             self._identities.take_up(saved.tracked())
-            self._taking_up = TakingUp(saved.graph_version, self._context.clock.now_ns())
+            self._taking_up = TakingUp(saved.graph_version, self._context.clock.now_ns(), saved=True)
             self._context.health.count("trees_taken_up", len(saved.trees))
             self._incomplete = True
 
     def _taken_up(self) -> bool:
-        """Return whether no trees of the run before wait for their map any more."""
+        """Return whether no known trees wait for their map any more."""
         if self._taking_up is not None:
             now_ns, patience_s = self._context.clock.now_ns(), self._config.await_map_s
             if not self._taking_up.over(self._identities, self._store, now_ns, patience_s):
@@ -164,7 +167,7 @@ class DetectorService:
             else:
                 result = self._incremental.update(points, views, touched)
         self._whole = self._whole or self._store.complete
-        for event in self._identities.update(result.trunks, whole=self._whole):
+        for event in self._identities.update(result.trunks, lambda place: self._whole and self._store.shows(place)):
             health.count(f"trees_{event.kind}")
             LOG.info("%s", event)
         self._identities.fasten(self._store.poses())

@@ -60,11 +60,11 @@ class System:
             self.mapper.publish(MAP_CLOUD, submap)
         self.rest()
 
-    def tell_index(self, *submaps: Submap, graph_version: int = 3) -> None:
-        """Say what the mapper holds."""
+    def tell_index(self, *submaps: Submap, graph_version: int = 3, epoch: int = 1) -> None:
+        """Say what the mapper holds; another ``epoch`` is another run of the mapper."""
         ids, versions = tuple(s.submap_id for s in submaps), tuple(s.version for s in submaps)
         index = MapIndex(
-            stamp_ns=self.hub.clock.now_ns(), map_id=submaps[0].map_id, epoch=1, graph_version=graph_version,
+            stamp_ns=self.hub.clock.now_ns(), map_id=submaps[0].map_id, epoch=epoch, graph_version=graph_version,
             submap_ids=ids, versions=versions, placed_by=tuple(s.graph_version for s in submaps), ground_sequence=0,
         )  # fmt: skip
         self.mapper.publish(MAP_INDEX, index)

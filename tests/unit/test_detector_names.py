@@ -91,6 +91,39 @@ def test_half_a_map_that_stays_half_is_not_waited_for_for_ever(tmp_path: Path) -
     assert 2 not in places(system.lists[-1])
 
 
+def test_a_mapper_that_starts_again_takes_no_tree_away(tmp_path: Path) -> None:
+    """On a busy machine it answers late: for a while the detector holds nothing of the map."""
+    submaps, _ = first_run(tmp_path)
+    system = started_again(tmp_path, *submaps)
+    count = len(system.lists)
+    system.whole = []
+    system.tell_index(*submaps, epoch=2)
+    system.send(submaps[1])
+    system.rest(10.0)
+    assert len(system.lists) == count
+    assert "trees_gone" not in system.detector._context.health.counters
+    system.whole = submaps
+    system.tell_index(*submaps, epoch=2)
+    system.send(submap_of(tree_cloud(BESIDE), 3))
+    assert places(system.lists[-1]) == {1: FAR, 2: NEAR, 3: BESIDE}
+
+
+def test_a_mapper_that_lost_its_map_takes_no_tree_away_that_it_does_not_look_at(tmp_path: Path) -> None:
+    submaps, _ = first_run(tmp_path)
+    system = started_again(tmp_path, *submaps)
+    looks = level_camera([0.0, 0.0, 1.5], float(np.arctan2(FAR[1], FAR[0])))
+    fresh = submap_of(tree_cloud(FAR), 8, T=looks, graph_version=4)
+    system.whole = [fresh]
+    system.tell_index(fresh, epoch=2, graph_version=4)
+    system.rest(31.0)
+    for version in range(2, 8):
+        system.send(submap_of(tree_cloud(FAR), 8, version, T=looks, graph_version=4))
+    assert places(system.lists[-1]) == {1: FAR, 2: NEAR}
+    for version in range(1, 7):
+        system.send(submap_of(np.concatenate([ground(5.0), tree_cloud(FAR)]), 9, version, graph_version=5))
+    assert places(system.lists[-1]) == {1: FAR}, "where the map shows none, there is none"
+
+
 @pytest.mark.parametrize("way_m", [0.6, -0.6])
 def test_ids_follow_corrections_made_meanwhile(tmp_path: Path, way_m: float) -> None:
     """Trees 0.6 m apart in a map that is moved by 0.6 m: each comes to stand where another was."""
