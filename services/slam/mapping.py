@@ -214,7 +214,8 @@ class Mapping:
         slots = np.concatenate([free, fixed]).astype(np.int32)
         index = np.full(len(kf.n), -1, np.int32)
         index[slots] = np.arange(len(slots))
-        problem = build(points, kf, ids, slots, index, self.camera.variance, self.far.disparity(self.camera.array[4]))
+        far = self.far.disparity(self.camera.array[4], _span_m(kf.R[slots], kf.t[slots]))
+        problem = build(points, kf, ids, slots, index, self.camera.variance, far)
         return Part(problem, ids, slots, len(free), self.turned)
 
     def _adjust(self, part: Part | None, robust_iterations: int, iterations: int, why: GraphReason) -> None:
@@ -315,3 +316,9 @@ class Mapping:
         if k < 0:
             raise KeyError(f"no keyframe {serial}")
         return inverse(pose(self.atlas.keyframes.R[k], self.atlas.keyframes.t[k])) @ relative
+
+
+def _span_m(R: F64, t: F64) -> float:
+    """Return how far apart cameras (C, 3, 3), (C, 3) stand: the diagonal of the box round their centres."""
+    centre = -np.einsum("cba,cb->ca", R, t)
+    return float(np.linalg.norm(np.ptp(centre, axis=0)))
