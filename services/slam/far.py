@@ -16,10 +16,10 @@ _KNOWN_SIGMA_INVERSE_M = 0.012
 """Parallax has told a distance when its inverse is known this well."""
 _LEAST_KNOWN = 60
 _SIGMA_RANGE_INVERSE_M = (0.02, 0.5)
-_SIGMA_PER_SPAN = 0.08
+_SIGMA_PER_SPAN = 0.06
 """By how much the belief is doubted more, 1/m, for each metre that the keyframes stand apart: where the camera turns on the spot
 it keeps far points from taking the camera along, where it goes parallax tells more, and a common error of the belief would
-make the way longer or shorter (a walk of 9 m: 24 cm too long without this, 1 to 3 cm with 0.06 to 0.12)."""
+make the way longer or shorter (a walk of 9 m: 24 cm too long without this, 1 to 3 cm with 0.06 to 0.12; after a smear more is worse)."""
 
 
 class FarPrior:
