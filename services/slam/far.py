@@ -16,10 +16,10 @@ _KNOWN_SIGMA_INVERSE_M = 0.012
 """Parallax has told a distance when its inverse is known this well."""
 _LEAST_KNOWN = 60
 _SIGMA_RANGE_INVERSE_M = (0.02, 0.5)
-_SIGMA_PER_SPAN = 0.06
-"""By how much the belief is doubted more, 1/m, for each metre that the keyframes stand apart: where the camera turns on the spot
-it keeps far points from taking the camera along, where it goes parallax tells more, and a common error of the belief would
-make the way longer or shorter (a walk of 9 m: 24 cm too long without this, 1 to 3 cm with 0.06 to 0.12; after a smear more is worse)."""
+_SPAN_M, _SIGMA_PER_SPAN = 2.0, 0.1
+"""Keyframes that stand farther apart than a start and its rise doubt the belief more, by so much (1/m) for each metre beyond: where the
+camera turns on the spot it keeps far points from taking the camera along, where it goes parallax tells more, and a common error
+of the belief would make the way longer or shorter (a walk of 9 m: 24 cm too long without this)."""
 
 
 class FarPrior:
@@ -38,7 +38,7 @@ class FarPrior:
 
         ``span_m``: how far apart the keyframes stand of whose adjustment it is part.
         """
-        sigma_inverse_m = math.hypot(self.sigma_inverse_m, _SIGMA_PER_SPAN * span_m)
+        sigma_inverse_m = math.hypot(self.sigma_inverse_m, _SIGMA_PER_SPAN * max(span_m - _SPAN_M, 0.0))
         return np.array([bf / self.distance_m, 1.0 / (bf * sigma_inverse_m) ** 2])
 
     def learn(self, points: Points, kf: Keyframes, focal: float) -> None:

@@ -51,7 +51,7 @@ class TrackResult:
 
 _FRAME_SCALE = 2.0
 """Matches err together: neighbours share their depth's pattern, points their keyframe."""
-_MAP_SIGMA = np.array([0.0033, 0.0040, 0.0031, 0.0010, 0.0005, 0.00075])
+_MAP_SIGMA = np.array([0.0033, 0.0053, 0.0028, 0.0016, 0.0006, 0.001])
 """Of the map around the camera, in the camera's axes, metres and radians; up and pitch are told apart worst. Measured on
 simulated turns (odd seeds 301 to 315) that are not among the bench's."""
 
