@@ -30,4 +30,26 @@ def announced_too_much(path: Path) -> str:
         return f"{records + late_records} records in {size} bytes"
     if not kind & _COMPRESSED and begin + points * length > size:
         return f"{points} points of {length} bytes in {size} bytes"
-    return ""
+    return _chunks_too_many(path, begin, size) if kind & _COMPRESSED else ""
+
+
+def _chunks_too_many(path: Path, begin: int, size: int) -> str:
+    """Return in words how many chunks a LAZ file announces and cannot hold: room is made for all of them before the first is read.
+
+    What cannot be had ends the process then, not the reading: the decompressor is Rust, and there is nothing to catch. Where the
+    points ``begin`` stands the chunk table's offset, -1: it is the file's last number. Isenburg, "LASzip" (2013), section 5.
+    """
+    with path.open("rb") as stream:
+        stream.seek(begin)
+        place = stream.read(8)
+        if place == b"\xff" * 8:
+            stream.seek(max(size - 8, 0))
+            place = stream.read(8)
+        if len(place) < 8:
+            return ""
+        (table,) = struct.unpack("<q", place)
+        if not begin < table <= size - 8:
+            return ""
+        stream.seek(table)
+        _, chunks = struct.unpack("<II", stream.read(8))
+    return f"{chunks} chunks in {size} bytes" if chunks > table - begin else ""
