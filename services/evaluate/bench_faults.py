@@ -1,7 +1,7 @@
 """The fault matrix, run: ``treedock bench faults``. Each row is a line in ``faults.jsonl``; a later call goes on from there.
 
 ``--scenes NAME,...`` runs only the rows so named (or groups), ``--count`` harms each process so often instead of three times; after
-``--minutes N`` no further row is begun, and what was run before is reported, each with the code that it ran on.
+``--minutes N`` no further row is begun, and what was run before is reported.
 """
 
 from __future__ import annotations
@@ -37,26 +37,17 @@ def run(options: BenchOptions) -> BenchReport:
         try:
             for row in wanted(options.scenes):
                 key = json.dumps({"row": row.name, "seed": seed, "moments": moments, "code": version})
-                results = _read_results(path)
-                values = results.get(key)
+                values = _read_results(path).get(key)
                 if values is None:
                     if options.minutes is not None and time.monotonic() - begun_s > 60.0 * options.minutes:
-                        found += earlier(results, row.name, seed, moments)
                         continue
-                    values = {**run_row(bench, row), "code": version}
+                    values = run_row(bench, row)
                     _append(path, {"key": key, **values})
                 options.tell(f"{row.name}: {verdict_of(values)}")
                 found.append(values)
         finally:
             bench.close()
     return report_of(found, seed, moments, version)
-
-
-def earlier(results: Mapping[str, dict[str, Any]], name: str, seed: int, moments: int) -> list[dict[str, Any]]:
-    """Return the last result of a row on other code, none or one, so that a table need not be of one day."""
-    sought = {"row": name, "seed": seed, "moments": moments}
-    keys = [key for key in results if sought.items() <= json.loads(key).items()]
-    return [{"code": json.loads(keys[-1])["code"], **results[keys[-1]]}] if keys else []
 
 
 def wanted(names: Sequence[str]) -> list[Row]:
@@ -107,8 +98,8 @@ def report_of(rows: Sequence[Mapping[str, Any]], seed: int, moments: int, versio
         "failed": sum(bool(row["failed"]) for row in rows), "skipped": sum(bool(row["skipped"]) for row in rows),
         "faults": sum(len(row["told"]) for row in rows), "back_s_max": worst("back_s"), "ready_s_max": worst("ready_s"), "held_s_max": worst("held_s"),
     }  # fmt: skip
-    lines = ["| row | where | verdict | held (s) | at rest (s) | way in 2 s (m) | noticed (s) | back (s) | ready (s) | took (s) | load | code |",
-             "|---|---|---|---|---|---|---|---|---|---|---|---|"]  # fmt: skip
+    lines = ["| row | where | verdict | held (s) | at rest (s) | way in 2 s (m) | noticed (s) | back (s) | ready (s) | took (s) | load |",
+             "|---|---|---|---|---|---|---|---|---|---|---|"]  # fmt: skip
     for row in rows:
         m = row["measured"]
         cells = " | ".join(
@@ -116,14 +107,13 @@ def report_of(rows: Sequence[Mapping[str, Any]], seed: int, moments: int, versio
             for k in ("held_s", "rest_s", "way_m", "noticed_s", "back_s", "ready_s")
         )
         lines.append(
-            f"| {row['row']} | {row['group']} | {verdict_of(row)} | {cells} | {row['seconds']:.0f} | {row['load']} | "
-            f"{row.get('code', version)[:7]} |"
+            f"| {row['row']} | {row['group']} | {verdict_of(row)} | {cells} | {row['seconds']:.0f} | {row['load']} |"
         )
     conditions = {
         "flight": "real processes under the real supervisor, simulated PX4 over MAVLink; slam, mapper, detector and refiner are "
                   "stand-ins with measured errors (services/evaluate/faults/standins.py); held and at rest in simulated time",
         "chain": "the real camera, slam, mapper, detector and refiner over a rendered recording at 15 Hz",
         "ready": "as back; on a machine with more to do than processors 0.5 s of pause and the processor time of the start",
-        "moments": f"{moments} per process and fault, drawn from the seed", "seed": f"{seed}", "code": version[:7],
+        "moments": f"{moments} per process and fault, drawn from the seed", "seed": f"{seed}", "code": version,
     }  # fmt: skip
     return BenchReport(figures=figures, conditions=conditions, table="\n".join(lines))

@@ -19,12 +19,13 @@ from services.slam.links import MAX_OBSERVATIONS, Keyframes, Points, observe_all
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
 
-
 T = TypeVar("T", Points, Keyframes)
 
 _POINTS, _KEYFRAMES = 1 << 18, 1 << 10
 """Reserved at first; a larger map is copied into twice the room."""
 _FIRST_POINTS, _FIRST_KEYFRAMES = 4096, 16
+_MOST_KEYFRAMES = 1 << 15
+"""Points name them in two bytes. They would take 2.3 GB."""
 
 
 def _zeros(shape: tuple[int, ...], dtype: DTypeLike) -> NDArray:
@@ -113,6 +114,8 @@ class Atlas:
         self.points.parallax[len(old.n) :] = -1.0
 
     def _grow_keyframes(self, k: int) -> None:
+        if k > _MOST_KEYFRAMES:
+            raise MemoryError(f"the map holds {_MOST_KEYFRAMES} keyframes, and no more are possible")
         old = self.keyframes
         if k > len(self._keyframe_room.n):
             self._keyframe_room = _copied(old, _keyframes(2 * k, self._features, self._cells))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from services.slam.detect import EDGE_PX, STRETCH_LEVEL, Detector, stretch
+from services.slam.detect import EDGE_PX, Detector, stretch
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
@@ -67,7 +67,7 @@ class Carrier:
             return found
         earlier = before.image if before.flat else stretch(before.image, least=0.0)
         now = searched if flat else stretch(image, least=0.0)
-        coarse = np.flatnonzero(before.octave >= STRETCH_LEVEL)
+        coarse = np.flatnonzero(before.octave >= self._detector.finest_stretched)
         if earlier is None or now is None or not len(coarse):
             return found
         if len(coarse) > _MOST:
@@ -86,7 +86,7 @@ class Carrier:
         """Return the carried corners, and of those found the ones that are others, as many as each level has room for."""
         scales = self._detector.scales
         whole = self._detector.whole_places(searched, xy, octave)
-        new = apart(xy, found[0], _APART_PX * scales[found[3]] / scales[STRETCH_LEVEL])
+        new = apart(xy, found[0], _APART_PX * scales[found[3]] / scales[self._detector.finest_stretched])
         room = quota - np.bincount(octave, minlength=len(scales))
         for level in np.unique(found[3]):
             of_level = np.flatnonzero(new & (found[3] == level))

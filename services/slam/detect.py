@@ -25,7 +25,7 @@ _CROWDED, _SPARSE = 8, 4
 _POOR = 0.5
 """Share of the corners wanted below which an image is searched again with its contrast stretched."""
 _STRETCH_BLUR_PX = 1.5
-STRETCH_LEVEL = 3
+_STRETCH_LEVEL = 3
 """The finest level searched in a stretched image: what is smaller is blurred away, and its corners lie where noise put them."""
 _STRETCH_TO, _STRETCH_LEAST, _STRETCH_MOST = 40.0, 2.0, 8.0
 """The standard deviation of grey values that the stretched image has, and how much it is stretched at least and at most."""
@@ -166,9 +166,11 @@ class Detector:
 
         shares = scale ** -np.arange(levels, dtype=float)
         self.quota = np.round(corners * shares / shares.sum()).astype(int)
-        coarse = np.where(np.arange(levels) >= min(STRETCH_LEVEL, levels - 1), shares, 0.0)
+        """Corners wanted of each level."""
+        self.finest_stretched = min(_STRETCH_LEVEL, levels - 1)
+        coarse = np.where(np.arange(levels) >= self.finest_stretched, shares, 0.0)
         self.coarse = np.floor(corners * coarse / coarse.sum()).astype(int)
-        """Corners wanted of each level of a stretched image."""
+        """The same of a stretched image."""
         self.scales = scale ** np.arange(levels, dtype=float)
         self._lowest = lowest
         self._threshold = [start] * levels

@@ -228,12 +228,13 @@ class Mapping:
                 adjust(problem, camera, part.free, rounds, robust)
             else:
                 adjust_large(problem, camera, part.free, rounds, robust, self.hurried)
-                give_back_memory()
                 if self.hurried():  # what was reached is taken, but not yet fit to say what does not fit
                     problem.use[:] = True
                     self.owe()
                     break
             gate(chi_squares(problem, camera), problem.info, 1.0, problem.use)
+        if part.free > _COMPILED_KEYFRAMES:
+            give_back_memory()
         with self.step():
             measured = self.atlas.points.parallax[part.ids] < 0.0
             self.depth_noise.learn(disparity_residuals(problem, camera, self.depth_noise.least_info, measured))

@@ -25,10 +25,10 @@ def _features(number: int) -> Features:
 
 
 def _filled(keyframes: int) -> Atlas:
-    """Return a map of keyframes that see one point in common and the rest each of their own."""
+    """Return a map of keyframes and of points, as many as each has features but one, that stand at its number."""
     atlas = Atlas(_FEATURES, _CELLS, 1.2, 8)
-    common = atlas.reserve_points(1)
-    atlas.points.n[common] = 1  # alive, and observed by slot 0 below
+    first = atlas.reserve_points(1)
+    atlas.points.n[first] = 1
     for number in range(keyframes):
         features = _features(number)
         own = atlas.reserve_points(len(features) - 1)
@@ -63,6 +63,13 @@ def test_a_map_larger_than_its_room_moves_to_a_larger_one(monkeypatch: pytest.Mo
     monkeypatch.setattr(module, "_POINTS", module._FIRST_POINTS)
     monkeypatch.setattr(module, "_KEYFRAMES", module._FIRST_KEYFRAMES)
     _check(_filled(300), 300)
+
+
+def test_a_map_of_more_keyframes_than_points_can_name_is_refused() -> None:
+    atlas = _filled(3)
+    with pytest.raises(MemoryError, match="32768 keyframes"):
+        atlas._grow_keyframes(40_000)
+    _check(atlas, 3)
 
 
 def test_growing_takes_no_copy_and_no_memory_for_what_was_not_written() -> None:

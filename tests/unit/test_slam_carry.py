@@ -102,6 +102,17 @@ def test_another_scene_carries_nothing_over() -> None:
     assert len(off_px(anew, now) + STEP_PX) > 0.4 * len(anew)
 
 
+def test_a_pyramid_of_two_levels_carries_too() -> None:
+    config = SlamConfig(levels=2)
+    one = Extractor(CAMERA, config)
+    frames = [one.extract(view(number, fog=True), DEPTH_M) for number in range(2)]
+    off = off_px(*frames)
+    assert len(off) > 100
+    assert spread_px(off) < 0.3 * spread_px(
+        off_px(*(Extractor(CAMERA, config).extract(view(n, fog=True), DEPTH_M) for n in (0, 1)))
+    )
+
+
 def test_places_below_a_pixel_and_beyond_the_edge() -> None:
     before, now = (stretch(view(number, fog=True)) for number in (0, 1))
     assert before is not None
