@@ -69,6 +69,6 @@ def give_way(nice: int) -> None:
 
 
 def give_back_memory() -> None:
-    """Give the machine back what was freed but is still held, after work that was large and seldom (glibc; else nothing happens)."""
+    """Give the machine back what was freed but is still held by the allocator (glibc; elsewhere nothing happens)."""
     with contextlib.suppress(AttributeError, OSError):
         ctypes.CDLL(None).malloc_trim(0)

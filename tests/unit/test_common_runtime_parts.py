@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 import os
+import resource
 import socket
 import threading
 import time
@@ -24,7 +25,7 @@ from services.common.health import HealthReporter
 from services.common.inbox import Inbox
 from services.common.logging import Throttle, set_up
 from services.common.memory import Hub
-from services.common.process import give_way, prepare_process
+from services.common.process import give_back_memory, give_way, prepare_process
 from services.common.session import free_port, port_is_free, split_endpoint
 
 
@@ -191,3 +192,18 @@ def test_somebody_without_a_home_has_kernels_all_the_same(tmp_path: Path, monkey
     prepare_process()
     gc.set_threshold(*before)
     assert str(tmp_path) not in os.environ["NUMBA_CACHE_DIR"]
+
+
+def test_what_a_full_queue_held_goes_back_to_the_machine() -> None:
+    queued = [bytes(20_000) for _ in range(5_000)]
+    full_mb = _resident_mb()
+    last = queued.pop()  # it keeps the allocator from giving the rest back by itself
+    queued.clear()
+    give_back_memory()
+    assert full_mb - _resident_mb() > 80.0
+    assert len(last) == 20_000
+
+
+def _resident_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * resource.getpagesize() / 1e6
