@@ -63,6 +63,9 @@ def bench(
         typer.echo(json.dumps({"bench": name, "figures": dict(report.figures)}))
 
 
+_PLACES = ("--out", "--data")
+
+
 def section_text(report: BenchReport) -> str:
     """Return conditions, table and figures as Markdown."""
     from services.evaluate.bench import machine
@@ -78,5 +81,16 @@ def write_section(doc: Path, name: str, text: str) -> None:
     from services.evaluate.bench import replace_section
 
     before = doc.read_text(encoding="utf-8") if doc.exists() else "# Benchmarks\n"
-    command = f"`{' '.join(['treedock', *sys.argv[1:]])}`"
+    command = f"`{' '.join(['treedock', *_without_places(sys.argv[1:])])}`"
     doc.write_text(replace_section(before, name, f"{command}\n\n{text}"), encoding="utf-8")
+
+
+def _without_places(arguments: list[str]) -> list[str]:
+    """Leave out where this machine keeps its files: the command is for others."""
+    kept: list[str] = []
+    previous = ""
+    for argument in arguments:
+        if previous not in _PLACES and argument.partition("=")[0] not in _PLACES:
+            kept.append(argument)
+        previous = argument
+    return kept

@@ -18,7 +18,7 @@ from services.slam.links import Keyframes, Points, describe, merge, observe, poi
 from services.slam.mapping import Mapping
 from services.slam.match import keep_common_turn
 from services.slam.places import Bag, Places
-from services.slam.posegraph import Edges, optimise
+from services.slam.posegraph import Edges, expect_nodes, optimise
 from services.slam.tracking import MATCH_BLIND, Tracked, Tracking, moved
 
 F64 = NDArray[np.float64]
@@ -69,6 +69,7 @@ class Loops:
 
     def consider(self, k: int) -> Correction | None:
         """Look whether the new keyframe ``k`` closes a loop; if so correct the map."""
+        expect_nodes(len(self.atlas.slots))
         with self.mapping.step():
             kf = self.atlas.keyframes
             bag = self.places.add(int(kf.serial[k]), kf.desc[k, : kf.n[k]])

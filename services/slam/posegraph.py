@@ -7,6 +7,8 @@ product; perturbations on the left, order (v, w). Jacobians by Sola et al. (2018
 from __future__ import annotations
 
 import math
+from functools import cache
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -116,12 +118,25 @@ def solve_normal(edges: Edges, blocks: F64, g: F64, free: NDArray[np.bool_]) -> 
         A[np.diag_indices(size)] += 1e-6
         out[free] = np.linalg.solve(A, rhs).reshape(-1, 6)
         return out
+    solver = sparse_solver()
+    sparse = solver.csc_matrix((values, (r, c)), shape=(size, size)) + 1e-6 * solver.eye(size, format="csc")
+    out[free] = solver.splu(sparse).solve(rhs).reshape(-1, 6)
+    return out
+
+
+@cache
+def sparse_solver() -> SimpleNamespace:
+    """Load what solves large graphs: 0.2 s of Python that a loop must not wait for, nor the first frames."""
     from scipy.sparse import csc_matrix, eye
     from scipy.sparse.linalg import splu
 
-    sparse = csc_matrix((values, (r, c)), shape=(size, size)) + 1e-6 * eye(size, format="csc")
-    out[free] = splu(sparse).solve(rhs).reshape(-1, 6)
-    return out
+    return SimpleNamespace(csc_matrix=csc_matrix, eye=eye, splu=splu)
+
+
+def expect_nodes(nodes: int) -> None:
+    """Be ready for a graph that grows: half way to where the sparse solver is needed it is loaded."""
+    if nodes >= _DENSE_NODES // 2:
+        sparse_solver()
 
 
 def optimise(R: F64, t: F64, edges: Edges, free: NDArray[np.bool_], iterations: int = 10) -> float:

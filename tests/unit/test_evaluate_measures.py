@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -177,11 +178,13 @@ def test_bench_json_ends_with_one_object(
     from services.cli.bench import bench
 
     monkeypatch.setattr(bench_catalogue, "run_scene", lambda name, *_, **__: row(name))
+    monkeypatch.setattr(sys, "argv", ["treedock", "bench", "catalogue", "--out", str(tmp_path), "--data=there", "--json"])
     bench("catalogue", out=tmp_path, scenes="single-01", doc=tmp_path / "b.md", as_json=True)
     printed = capsys.readouterr()
     assert json.loads(printed.out)["bench"] == "catalogue"
     assert "machine" in printed.err
-    assert "## catalogue" in (tmp_path / "b.md").read_text()
+    section = "## catalogue\n\n`treedock bench catalogue --json`\n"  # without this machine's folders
+    assert section in (tmp_path / "b.md").read_text()
 
 
 @pytest.mark.parametrize("keep", [True, False])

@@ -67,3 +67,11 @@ def test_the_same_optimum_as_gtsam(nodes: int) -> None:
     ours, theirs = np.einsum("nba,nb->na", R, t), np.einsum("nba,nb->na", theirs_R, theirs_t)
     assert np.linalg.norm(ours - theirs, axis=1).max() < 0.02 * before_m
     np.testing.assert_allclose(R @ R.transpose(0, 2, 1), np.broadcast_to(np.eye(3), R.shape), atol=1e-9)
+
+
+def test_no_loop_waits_for_the_sparse_solver_to_load() -> None:
+    posegraph.sparse_solver.cache_clear()
+    posegraph.expect_nodes(posegraph._DENSE_NODES // 2 - 1)  # first frames do not wait for it either
+    assert posegraph.sparse_solver.cache_info().currsize == 0
+    posegraph.expect_nodes(posegraph._DENSE_NODES // 2)
+    assert posegraph.sparse_solver.cache_info().currsize == 1
