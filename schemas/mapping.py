@@ -139,7 +139,7 @@ Cell = Annotated[int, Field(ge=-(2**31), lt=2**31)]
 
 
 class MapIndex(Message):
-    """What the mapper holds: a consumer that holds anything else has missed a delta and asks ``map/cloud`` for the whole.
+    """What the mapper holds: a consumer that holds anything else has missed a delta and asks ``map/cloud`` for it.
 
     The three lists run side by side, one entry for each submap that has points.
     """
@@ -167,6 +167,18 @@ class MapIndex(Message):
                 f"{len(self.submap_ids)} submaps, {len(self.versions)} versions and {len(self.placed_by)} places: one of each was expected"
             )
         return self
+
+
+class SubmapsWanted(Message):
+    """A query of ``map/cloud`` that asks for some submaps: who misses a few does not need the whole map again.
+
+    The mapper answers with those that it has, if its map is the one named; without this payload it answers with all.
+    """
+
+    SCHEMA: ClassVar[str] = "treedock.submaps_wanted"
+
+    map_id: Name
+    submap_ids: Annotated[tuple[Counter, ...], Field(min_length=1, max_length=1000)]
 
 
 class GroundCell(Part):

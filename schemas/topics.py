@@ -119,7 +119,7 @@ SLAM_KEYFRAME = Topic("slam/keyframe", Keyframe, "slam", ("mapper",), 0, None, _
 SLAM_GRAPH = Topic("slam/graph", Graph, "slam", ("mapper",), 0, None, _A, _ADVANCED, "data_high",
                    description="all keyframe poses after a correction")  # fmt: skip
 MAP_CLOUD = Topic("map/cloud", Submap, "mapper", ("detector",), 0, None, _A, _STREAM, "data_low",
-                  description="submaps as they change; a queryable answers with the whole map")  # fmt: skip
+                  description="submaps as they change; a queryable answers with the whole map, or with those that SubmapsWanted names")  # fmt: skip
 MAP_SKETCH = Topic("map/sketch", SubmapSketch, "mapper", ("station",), 0, None, _R, _STREAM, "background", recorded=False,
                    description="submaps thinned for the 3D view over the radio, sent only while somebody looks; a queryable answers with the whole")  # fmt: skip
 MAP_INDEX = Topic("map/index", MapIndex, "mapper", ("detector",), 0, None, _A, _LATEST, "data_low",

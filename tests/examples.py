@@ -12,7 +12,7 @@ from schemas.command import Command, CommandReply, NonceReply, NonceRequest
 from schemas.fleet import ClaimGoal, ClaimReply, ClaimRequest, HeldState
 from schemas.fusion import EarthPlace, FusionState
 from schemas.health import Health
-from schemas.mapping import GroundCell, GroundPatch, MapIndex, Submap
+from schemas.mapping import GroundCell, GroundPatch, MapIndex, Submap, SubmapsWanted
 from schemas.navigation import Guidance, MissionState, Setpoint
 from schemas.preview import PreviewImage
 from schemas.simulation import SimClock, SimTruth, TrueTree
@@ -87,6 +87,7 @@ def all_messages() -> dict[str, Wire]:
         sketch(),
         MapIndex(stamp_ns=66_000_000, map_id="map-1", epoch=1, graph_version=9, submap_ids=(5,), versions=(2,), placed_by=(9,),
                  ground_sequence=4),
+        SubmapsWanted(map_id="map-1", submap_ids=(5, 7)),
         GroundPatch(stamp_ns=66_000_000, map_id="map-1", graph_version=9, sequence=4, cell_m=0.5, gone=((3, -2),), cells=(
             GroundCell(column=-1, row=2, height_m=-1.5, slope_x=0.1, slope_y=-0.02, relief_m=0.015, points=212),)),
         Pose(stamp_ns=66_000_000, seq=1, map_id="map-1", status="tracking", T_map_camera=POSE, covariance=COVARIANCE,

@@ -214,28 +214,41 @@ class Bus:
 
         def deliver(query: zenoh.Query) -> None:
             with query:
-                try:
-                    request = self._decode(kind, query, topic.max_bytes)
-                except DecodeError as error:
-                    self.health.count(f"decode_errors.{topic.name}")
-                    self._fault(topic.name, f"refused a query on {query.key_expr}: {error}")
-                    query.reply_err(str(error).encode(), encoding="text/plain")
-                    return
-                reply = handler(request)
+                request = self._request(topic, query, kind)
+                reply = None if request is None else handler(request)
                 if reply is not None:
                     self._reply(topic, query, reply, leaf)
 
         self._declare_queryable(topic.key(self.uav, leaf), deliver)
 
-    def answer_state(self, topic: Topic, handler: Callable[[], list[Wire]]) -> None:
-        """Answer payload-less queries with all messages that ``handler`` returns."""
+    def answer_state(
+        self, topic: Topic, handler: Callable[[], list[Wire]], kind: type[Q] | None = None,
+        chosen: Callable[[Q], list[Wire]] | None = None,
+    ) -> None:  # fmt: skip
+        """Answer payload-less queries with all messages that ``handler`` returns, those with a ``kind`` by ``chosen``."""
 
         def deliver(query: zenoh.Query) -> None:
             with query:
-                for message in handler():
+                if kind is None or chosen is None or query.payload is None:
+                    messages = handler()
+                elif (request := self._request(topic, query, kind)) is not None:
+                    messages = chosen(request)
+                else:
+                    return
+                for message in messages:
                     self._reply(topic, query, message, None)
 
         self._declare_queryable(topic.key(self.uav), deliver)
+
+    def _request(self, topic: Topic, query: zenoh.Query, kind: type[Q]) -> Q | None:
+        """Return what a query carries; None when it cannot be decoded: the asker is told why."""
+        try:
+            return self._decode(kind, query, topic.max_bytes)
+        except DecodeError as error:
+            self.health.count(f"decode_errors.{topic.name}")
+            self._fault(topic.name, f"refused a query on {query.key_expr}: {error}")
+            query.reply_err(str(error).encode(), encoding="text/plain")
+            return None
 
     def _reply(self, topic: Topic, query: zenoh.Query, message: Wire, leaf: str | None) -> None:
         key = query.key_expr if leaf is None and topic.name.endswith("*") else topic.key(self.uav, leaf)

@@ -110,8 +110,14 @@ class Context(Protocol):
         """Answer queries on ``topic``'s key: the request is decoded as ``kind``; None gives no reply."""
         ...
 
-    def answer_state(self, topic: Topic, handler: Callable[[], list[Wire]]) -> None:
-        """Answer payload-less queries on a published topic's key with its whole present state."""
+    def answer_state(
+        self, topic: Topic, handler: Callable[[], list[Wire]], kind: type[Q] | None = None,
+        chosen: Callable[[Q], list[Wire]] | None = None,
+    ) -> None:  # fmt: skip
+        """Answer payload-less queries on a published topic's key with its whole present state.
+
+        A query that carries a ``kind`` is answered with what ``chosen`` returns for it: a part of the state.
+        """
         ...
 
     def ask(

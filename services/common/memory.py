@@ -41,6 +41,7 @@ class Hub:
     _handlers: dict[str, list[Handler]] = field(default_factory=dict)
     _answers: dict[str, Callable[[Any], Wire | None]] = field(default_factory=dict)
     _states: dict[str, Callable[[], list[Wire]]] = field(default_factory=dict)
+    _chosen: dict[str, Callable[[Any], list[Wire]]] = field(default_factory=dict)
     _timers: list[_Timer] = field(default_factory=list)
     _at_stop: list[Callable[[], None]] = field(default_factory=list)
     live: set[str] = field(default_factory=set)
@@ -126,9 +127,15 @@ class MemoryContext:
         del kind
         self._hub._answers[topic.key(self.uav, leaf)] = handler  # noqa: SLF001
 
-    def answer_state(self, topic: Topic, handler: Callable[[], list[Wire]]) -> None:
-        """Register the one that answers with a topic's whole state."""
+    def answer_state(
+        self, topic: Topic, handler: Callable[[], list[Wire]], kind: type[Q] | None = None,
+        chosen: Callable[[Q], list[Wire]] | None = None,
+    ) -> None:  # fmt: skip
+        """Register the one that answers with a topic's whole state, or with a part of it."""
+        del kind
         self._hub._states[topic.key(self.uav)] = handler  # noqa: SLF001
+        if chosen is not None:
+            self._hub._chosen[topic.key(self.uav)] = chosen  # noqa: SLF001
 
     def ask(
         self, topic: Topic, request: Wire | None, kind: type[A], timeout_s: float, leaf: str | None = None
@@ -136,9 +143,12 @@ class MemoryContext:
         """Ask at once: in memory nobody is late."""
         del timeout_s
         key = topic.key(self.uav, leaf)
+        state, chosen = self._hub._states.get(key), self._hub._chosen.get(key)  # noqa: SLF001
+        if state is not None:
+            replies = state() if request is None or chosen is None else chosen(request)
+            return [reply for reply in replies if isinstance(reply, kind)]
         if request is None:
-            state = self._hub._states.get(key)  # noqa: SLF001
-            return [reply for reply in (state() if state else []) if isinstance(reply, kind)]
+            return []
         handler = self._hub._answers.get(key)  # noqa: SLF001
         reply = handler(request) if handler else None
         return [reply] if isinstance(reply, kind) else []

@@ -129,9 +129,12 @@ class LiveContext:
         """Answer queries that carry a ``kind``."""
         self.bus.answer(topic, kind, handler, leaf)
 
-    def answer_state(self, topic: Topic, handler: Callable[[], list[Wire]]) -> None:
-        """Answer payload-less queries with the whole state."""
-        self.bus.answer_state(topic, handler)
+    def answer_state(
+        self, topic: Topic, handler: Callable[[], list[Wire]], kind: type[Q] | None = None,
+        chosen: Callable[[Q], list[Wire]] | None = None,
+    ) -> None:  # fmt: skip
+        """Answer payload-less queries with the whole state, others with the part they name."""
+        self.bus.answer_state(topic, handler, kind, chosen)
 
     def ask(
         self, topic: Topic, request: Wire | None, kind: type[A], timeout_s: float, leaf: str | None = None

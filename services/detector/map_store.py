@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,7 +13,7 @@ from services.detector.incremental import Cells, cells_of
 from services.detector.model import Floats, Views
 
 _PATIENCE_S = (2.0, 30.0)
-"""Least and longest time between two questions for the whole map."""
+"""Least and longest time between two questions that do not help."""
 _RANGE_M = 6.0
 """As far as the mapper believes the depth image."""
 _TRUNK_M = 0.6
@@ -50,6 +50,8 @@ class MapStore:
         """The last that was heard of this map."""
         self._absent: set[int] = set()
         """Held here, not listed in the last index: gone, or newer than the index."""
+        self._moved_unseen: set[int] = set()
+        """Submaps that were moved but whose points never came, since the last index."""
         self._patience_s, self._not_before_ns = _PATIENCE_S[0], 0
         self._held: dict[int, _Held] = {}
 
@@ -59,7 +61,7 @@ class MapStore:
     def clear(self, map_id: str) -> None:
         """Begin a new map."""
         self.map_id, self.graph_version, self._held, self._index = map_id, 0, {}, None
-        self.changed_points, self._touched = 0, frozenset()
+        self.changed_points, self._touched, self._moved_unseen = 0, frozenset(), set()
         self._patience_s, self._not_before_ns = _PATIENCE_S[0], 0
 
     def settle(self) -> Cells:
@@ -68,13 +70,15 @@ class MapStore:
         return touched
 
     def take(self, submap: Submap) -> bool:
-        """Take up a submap message; return False when its points are missing here (ask for the whole map)."""
+        """Take up a submap message; return False when its points are missing here (``missing`` names it)."""
         self.graph_version = max(self.graph_version, submap.graph_version)
         held = self._held.get(submap.submap_id)
+        self._moved_unseen.discard(submap.submap_id)
         if submap.removed:
             self._drop({submap.submap_id} & set(self._held))
             return True
         if len(submap.points_m) == 0 and (held is None or held.version != submap.version):
+            self._moved_unseen.add(submap.submap_id)
             return False
         if held is not None and (submap.version, submap.graph_version) < (held.version, held.placed_by):
             return True  # an answer to a query that a newer delta has overtaken
@@ -95,7 +99,7 @@ class MapStore:
         return True
 
     def lacks(self, index: MapIndex, now_ns: int) -> bool:
-        """Return whether the mapper holds more or newer than this store, so that the whole is to be asked for.
+        """Return whether the mapper holds more or newer than this store, so that what is ``missing`` is to be asked for.
 
         What the mapper does not hold any more, two indexes in a row, goes. Asking is answered with yes at most every 2 s, and ever more seldom
         (to 30 s) while it does not help. An index of another map is nothing to go by: its submaps come first.
@@ -109,7 +113,7 @@ class MapStore:
         absent = set(self._held) - set(index.submap_ids)
         self._drop(absent & self._absent)
         self._absent = absent - self._absent
-        self._index = index
+        self._index, self._moved_unseen = index, set()
         if self.complete:
             self._patience_s = _PATIENCE_S[0]
             return False
@@ -119,13 +123,24 @@ class MapStore:
         self._patience_s = min(2.0 * self._patience_s, _PATIENCE_S[1])
         return True
 
+    def was_helped(self) -> None:
+        """Note that a question brought something: the next one need not wait long."""
+        self._patience_s, self._not_before_ns = _PATIENCE_S[0], 0
+
     @property
     def complete(self) -> bool:
         """Whether an index of this map was heard and all that it lists is held."""
+        return self._index is not None and not any(True for _ in self._listed_not_held())
+
+    def missing(self) -> list[int]:
+        """Return the submaps whose points are not here, or not the newest, as far as is known, the oldest first."""
+        return sorted(self._moved_unseen.union(self._listed_not_held()))
+
+    def _listed_not_held(self) -> Iterator[int]:
         if self._index is None:
-            return False
+            return
         entries = zip(self._index.submap_ids, self._index.versions, self._index.placed_by, strict=True)
-        return all(self._is_as_new(*entry) for entry in entries)
+        yield from (entry[0] for entry in entries if not self._is_as_new(*entry))
 
     def _is_as_new(self, submap_id: int, version: int, placed_by: int) -> bool:
         held = self._held.get(submap_id)

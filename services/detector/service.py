@@ -6,7 +6,7 @@ import logging
 import os
 
 from schemas.codec import Wire
-from schemas.mapping import MapIndex, Submap
+from schemas.mapping import MapIndex, Submap, SubmapsWanted
 from schemas.topics import MAP_CLOUD, MAP_INDEX, SLAM_POSE, TREES_LIST, TREES_TARGET
 from schemas.trees import Target, Tree, TreeList
 from services.common.context import Context
@@ -23,6 +23,8 @@ from services.detector.report import as_tree
 LOG = logging.getLogger(__name__)
 
 _ASK_TIMEOUT_S = 2.0
+_ASKED_AT_ONCE = 32
+"""Submaps of one question: few enough (some MB) to be answered in time on a machine that has much else to do."""
 _VERSIONS_LOST = 1000
 """More lists than a run can have sent after it last wrote their number."""
 _QUIET_S = 2.0
@@ -49,6 +51,7 @@ class DetectorService:
         self._whole = True
         """Whether the map has been whole since known trees waited for it."""
         self._incomplete = False
+        self._asking = False
         self._graph_version = 0
         """Of the map at the last detection."""
         self._version = 0
@@ -94,8 +97,8 @@ class DetectorService:
 
     def on_timer(self) -> None:
         """Detect when the map changed since the last time; else tell of what the refiner found since."""
-        if self._incomplete:
-            self._fetch_whole_map()
+        if self._incomplete and not self._asking:
+            self._ask_for_missing()
         if not self._taken_up():
             return
         self._quiet = 0 if self._store.changed_points > 0 else self._quiet + 1
@@ -142,13 +145,26 @@ class DetectorService:
             self._taking_up, self._whole = None, False
         return True
 
-    def _fetch_whole_map(self) -> None:
-        self._incomplete = False
-        replies = self._context.ask(MAP_CLOUD, None, Submap, _ASK_TIMEOUT_S)
-        self._context.health.count("map_queries")
+    def _ask_for_missing(self) -> None:
+        """Ask for some of what is missing; nobody waits for the answer."""
+        missing = self._store.missing()[:_ASKED_AT_ONCE]
+        self._incomplete, self._asking = False, bool(missing)
+        if missing:
+            wanted = SubmapsWanted(map_id=self._store.map_id, submap_ids=tuple(missing))
+            self._context.health.count("map_queries")
+            self._context.ask_later(MAP_CLOUD, wanted, Submap, _ASK_TIMEOUT_S, self._on_missing)
+
+    def _on_missing(self, replies: list[Submap]) -> None:
+        """Take up what was missing, and go on asking while that helps; else the next index asks again, ever more seldom."""
+        self._asking = False
+        before = len(self._store.missing())
         for submap in replies:
             if submap.map_id == self._store.map_id and len(submap.points_m) > 0:
                 self._store.take(submap)
+        left = len(self._store.missing())
+        if left < before:
+            self._store.was_helped()
+        self._incomplete = self._incomplete or 0 < left < before
 
     @property
     def result(self) -> DetectionResult | None:

@@ -85,10 +85,13 @@ class RenamedContext:
         if (other := self._names.get(topic, topic)) is not None:
             self._context.answer(other, kind, handler, leaf)
 
-    def answer_state(self, topic: Topic, handler: Callable[[], list[Wire]]) -> None:
+    def answer_state(
+        self, topic: Topic, handler: Callable[[], list[Wire]], kind: type[Q] | None = None,
+        chosen: Callable[[Q], list[Wire]] | None = None,
+    ) -> None:  # fmt: skip
         """Answer under the other name."""
         if (other := self._names.get(topic, topic)) is not None:
-            self._context.answer_state(other, handler)
+            self._context.answer_state(other, handler, kind, chosen)
 
     def ask(
         self, topic: Topic, request: Wire | None, kind: type[A], timeout_s: float, leaf: str | None = None

@@ -2,20 +2,20 @@
 
 ``map/cloud`` carries one submap per message. New or thinned points come with a new ``version``. A submap that the
 graph merely moved is sent with its old version, its new pose and no points; ``removed`` withdraws a submap.
-``map/index`` says what there is: whoever holds less or older asks ``map/cloud`` for the whole map.
+``map/index`` says what there is: whoever holds less or older asks ``map/cloud`` for it, or for the whole map.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
 
 from schemas.camera import Intrinsics
 from schemas.codec import Wire
-from schemas.mapping import MapIndex
+from schemas.mapping import MapIndex, SubmapsWanted
 from schemas.slam import Graph, Keyframe, Transform
 from schemas.topics import MAP_CLOUD, MAP_GROUND, MAP_INDEX, MAP_SKETCH, SLAM_GRAPH, SLAM_KEYFRAME
 from services.camera.codecs import FrameError, decode_colour_image, decode_depth
@@ -67,7 +67,7 @@ class MapperService:
         context.on(SLAM_KEYFRAME, self.on_keyframe)
         context.on(SLAM_GRAPH, self.on_graph)
         context.every(_LOOK_S, self.on_timer)
-        context.answer_state(MAP_CLOUD, self.whole_map)
+        context.answer_state(MAP_CLOUD, self.whole_map, SubmapsWanted, self.wanted_submaps)
         context.answer_state(MAP_SKETCH, self.whole_sketch)
         context.answer_state(MAP_GROUND, lambda: list(self._ground.whole(self._occasion())))
         if self._keeper is not None:
@@ -153,8 +153,16 @@ class MapperService:
 
     def whole_map(self) -> list[Wire]:
         """Return every submap with its points."""
+        return self._with_points(self.map.submaps.values())
+
+    def wanted_submaps(self, wanted: SubmapsWanted) -> list[Wire]:
+        """Return the submaps that somebody misses; those of another map are not here."""
+        submaps = self.map.submaps if wanted.map_id == self.map.map_id else {}
+        return self._with_points(submaps[number] for number in wanted.submap_ids if number in submaps)
+
+    def _with_points(self, submaps: Iterable[MapSubmap]) -> list[Wire]:
         version = self._graph_version
-        return [as_message(s, self.map.map_id, version, points=True) for s in self.map.submaps.values() if len(s.points_m)]  # fmt: skip
+        return [as_message(s, self.map.map_id, version, points=True) for s in submaps if len(s.points_m)]
 
     def whole_sketch(self) -> list[Wire]:
         """Return every submap as the radio carries it."""

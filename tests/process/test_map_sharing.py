@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from schemas.camera import Intrinsics
-from schemas.mapping import GroundPatch, MapIndex, Submap
+from schemas.mapping import GroundPatch, MapIndex, Submap, SubmapsWanted
 from schemas.slam import Graph, GraphNode, Keyframe
 from schemas.topics import MAP_CLOUD, MAP_GROUND, MAP_INDEX, SLAM_GRAPH, SLAM_KEYFRAME
 from services.camera.codecs import encode_depth
@@ -82,7 +82,11 @@ class Follower:
         if self.wants:
             self.wants = False
             self.asked += 1
-            for submap in self.whole():
+            missing = self.store.missing()
+            wanted = SubmapsWanted(map_id=self.store.map_id, submap_ids=tuple(missing))
+            replies = self.bus.ask(MAP_CLOUD, wanted, Submap, 3.0)
+            assert {submap.submap_id for submap in replies} <= set(missing), "nothing but what was asked for"
+            for submap in replies:
                 self.store.take(submap)
 
 

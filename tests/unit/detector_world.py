@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
 
-from schemas.mapping import MapIndex, Submap
+from schemas.codec import Wire
+from schemas.mapping import MapIndex, Submap, SubmapsWanted
 from schemas.topics import MAP_CLOUD, MAP_INDEX, TREES_LIST
 from schemas.trees import TreeList
 from services.common.config import TreedockConfig
@@ -52,8 +55,14 @@ class System:
         self.lists: list[TreeList] = []
         self.mapper = self.hub.context("mapper")
         self.whole: list[Submap] = []
-        self.mapper.answer_state(MAP_CLOUD, lambda: list(self.whole))
+        self.at_once = 1000
+        """Submaps that the mapper gets sent before whoever asked gives up."""
+        self.mapper.answer_state(MAP_CLOUD, lambda: list(self.whole), SubmapsWanted, self._wanted)
         self.hub.context("navigator").on(TREES_LIST, self.lists.append)
+
+    def _wanted(self, wanted: SubmapsWanted) -> list[Wire]:
+        chosen = (s for s in self.whole if s.map_id == wanted.map_id and s.submap_id in wanted.submap_ids)
+        return list(islice(chosen, self.at_once))
 
     def send(self, *submaps: Submap) -> None:
         for submap in submaps:

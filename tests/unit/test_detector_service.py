@@ -59,6 +59,30 @@ def test_a_missed_delta_is_made_up_for() -> None:
     assert system.detector._context.health.counters["map_queries"] == 1
 
 
+def test_a_mapper_that_sends_little_in_time_is_asked_for_the_rest() -> None:
+    system = System()
+    system.whole = [submap_of(_forest(), submap_id=number) for number in range(1, 51)]
+    system.at_once = 5
+    system.tell_index(*system.whole)
+    system.rest(3.0)
+    assert system.detector._store.complete
+    assert system.detector._context.health.counters["map_queries"] == 10, "each brought what was missing"
+
+
+def test_a_mapper_that_does_not_answer_is_asked_ever_more_seldom() -> None:
+    system = System()
+    absent = [submap_of(_forest(), submap_id=number) for number in range(1, 4)]
+    for _ in range(60):
+        system.tell_index(*absent)
+        system.rest(0.5)  # an index a second
+    assert system.detector._context.health.counters["map_queries"] == 5  # after 0, 2, 6, 14 and 30 s
+    system.whole = absent
+    for _ in range(30):
+        system.tell_index(*absent)
+        system.rest(0.5)
+    assert system.detector._store.complete
+
+
 def test_withdrawn_and_new_maps() -> None:
     system = System()
     system.send(submap_of(_forest()))

@@ -178,7 +178,9 @@ def test_bench_json_ends_with_one_object(
     from services.cli.bench import bench
 
     monkeypatch.setattr(bench_catalogue, "run_scene", lambda name, *_, **__: row(name))
-    monkeypatch.setattr(sys, "argv", ["treedock", "bench", "catalogue", "--out", str(tmp_path), "--data=there", "--json"])
+    monkeypatch.setattr(
+        sys, "argv", ["treedock", "bench", "catalogue", "--out", str(tmp_path), "--data=there", "--json"]
+    )
     bench("catalogue", out=tmp_path, scenes="single-01", doc=tmp_path / "b.md", as_json=True)
     printed = capsys.readouterr()
     assert json.loads(printed.out)["bench"] == "catalogue"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from schemas.camera import Intrinsics
-from schemas.mapping import GroundPatch, MapIndex, Submap
+from schemas.mapping import GroundPatch, MapIndex, Submap, SubmapsWanted
 from schemas.slam import Graph, GraphNode, Keyframe
 from schemas.topics import MAP_CLOUD, MAP_GROUND, MAP_INDEX, SLAM_GRAPH, SLAM_KEYFRAME
 from services.camera.codecs import encode_depth
@@ -48,7 +48,8 @@ class Consumer:
             self.store.clear(index.map_id)
         if self.store.lacks(index, self.context.clock.now_ns()):
             self.asked += 1
-            for submap in self.context.ask(MAP_CLOUD, None, Submap, 1.0):
+            wanted = SubmapsWanted(map_id=self.store.map_id, submap_ids=tuple(self.store.missing()))
+            for submap in self.context.ask(MAP_CLOUD, wanted, Submap, 1.0):
                 self._take(submap)
 
 

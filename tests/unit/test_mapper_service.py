@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from schemas.camera import Intrinsics
-from schemas.mapping import Submap
+from schemas.mapping import Submap, SubmapsWanted
 from schemas.sketch import SubmapSketch
 from schemas.slam import Graph, GraphNode, Keyframe
 from schemas.topics import MAP_CLOUD, MAP_SKETCH, SLAM_GRAPH, SLAM_KEYFRAME
@@ -125,6 +125,21 @@ def test_whole_map_answers_a_late_joiner() -> None:
     late = system.hub.context("detector").ask(MAP_CLOUD, None, Submap, 1.0)
     assert [s.submap_id for s in late] == [1, 2]
     assert sum(len(s.points_m) for s in late) == len(system.mapper.cloud().points_m)
+
+
+def test_who_misses_a_submap_gets_that_one_alone() -> None:
+    system = _Listener()
+    for number in (1, 2, 3):
+        system.send(_keyframe(number, level_camera([0, 0, 1.5], 1.0 * number)))
+    detector = system.hub.context("detector")
+
+    def answer(map_id: str, *numbers: int) -> list[int]:
+        wanted = SubmapsWanted(map_id=map_id, submap_ids=numbers)
+        return [s.submap_id for s in detector.ask(MAP_CLOUD, wanted, Submap, 1.0)]
+
+    assert answer("m1", 3, 1) == [3, 1]
+    assert answer("m1", 2, 9) == [2], "one that is gone is no answer"
+    assert answer("m0", 1) == [], "another map's are not here"
 
 
 def test_the_radio_gets_a_sketch_of_each_submap_while_somebody_looks() -> None:
