@@ -144,6 +144,14 @@ class Atlas:
         observe_all(self.points, kf, k, point)
         return k
 
+    def keyframe_poses(self) -> dict[int, F64]:
+        """Return T_map_camera (4, 4) of each living keyframe by id, in order of id."""
+        kf, slots = self.keyframes, self.slots
+        T = np.tile(np.eye(4), (len(slots), 1, 1))
+        T[:, :3, :3] = kf.R[slots].transpose(0, 2, 1)
+        T[:, :3, 3] = -np.einsum("nba,nb->na", kf.R[slots], kf.t[slots])
+        return dict(zip(kf.serial[slots].tolist(), T, strict=True))
+
     def features_of(self, k: int) -> Features:
         """Return a keyframe's features as they were extracted."""
         kf, n = self.keyframes, int(self.keyframes.n[k])

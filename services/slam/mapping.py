@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.slam import GraphReason
-from services.common.geometry import inverse, orthonormal, pose
+from services.common.geometry import orthonormal
 from services.common.process import give_back_memory
 from services.slam.atlas import Atlas, neighbours
 from services.slam.bundle import Problem, adjust, adjust_large, build, chi_squares, disparity_residuals
@@ -17,10 +17,10 @@ from services.slam.config import SlamConfig
 from services.slam.depth_noise import DepthNoise
 from services.slam.far import FarPrior
 from services.slam.features import Features
-from services.slam.links import create_points, points_of, remove_keyframe, shared_counts
+from services.slam.links import create_points, points_of, shared_counts
 from services.slam.refine import gate
-from services.slam.tidy import cull_recent, describe_all, drop_outliers, fuse, redundancy
-from services.slam.tracking import moved
+from services.slam.thinning import Thinning
+from services.slam.tidy import cull_recent, describe_all, drop_outliers, fuse
 from services.slam.worker import Crew
 
 F64 = NDArray[np.float64]
@@ -31,11 +31,6 @@ _COMPILED_KEYFRAMES = 24
 _TRIES = 3
 """Of a large adjustment that keyframes cut short: each goes on where the last one stopped. On a walk keyframes never cease, and trying
 for ever took half a core (6,000 frames: 1.28 cores); when the camera rests it is done in any case."""
-_REDUNDANT = 0.9
-_BEHIND, _REDUNDANT_BEHIND = 100, 0.6
-"""A keyframe goes whose points three others see to such a share; and to this, once so many younger ones live."""
-_CLOSE_M, _CLOSE_RAD, _REDUNDANT_CLOSE = 0.6, 0.25, 0.3
-"""And to this, when those before and after it stand so close together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +68,7 @@ class Mapping:
         """Up by one whenever the whole map was turned."""
         self.turned: F64 = np.eye(3)
         """All its turns so far, (3, 3), one new array for each: what a job computed before a turn is turned after it."""
-        self.retired: dict[int, tuple[int, F64]] = {}
-        """Culled keyframes: serial -> (serial of its stand-in, T_standin_keyframe)."""
+        self.thinning = Thinning(atlas, crew)
         self._recent = np.zeros((0, 2), np.int32)
 
     def hurried(self) -> bool:
@@ -104,8 +98,8 @@ class Mapping:
             self.adjust_window(k)
         with self.step():
             self.far.learn(atlas.points, atlas.keyframes, self.camera.focal)
-        self._cull_keyframes(k)
-        self._thin()
+        self.thinning.cull_about(k)
+        self.thinning.cull_behind()
         self.pay(k)
 
     def owe(self) -> None:
@@ -241,6 +235,14 @@ class Mapping:
             self._apply(part)
             self.why = why
 
+    def keyframe_pose(self, serial: int) -> F64:
+        """Return T_map_keyframe (4, 4) of a keyframe that lives, or lived.
+
+        Raises:
+            KeyError: for a serial that never was.
+        """
+        return self.thinning.pose_of(serial)
+
     def _apply(self, part: Part) -> None:
         """Take over an adjustment. Its points and keyframes are still there: only mapping ends any."""
         points, kf, problem = self.atlas.points, self.atlas.keyframes, part.problem
@@ -264,59 +266,6 @@ class Mapping:
     def turn_since(self, before: F64) -> F64 | None:
         """Return what takes map points of when ``turned`` was ``before`` to now's, (3, 3); None when the map stands."""
         return None if self.turned is before else self.turned @ before.T
-
-    def _cull_keyframes(self, k: int) -> None:
-        atlas = self.atlas
-        with self.step():
-            near = neighbours(atlas, k, 15, 30)
-        for other in near:
-            with self.step():
-                kf = atlas.keyframes
-                if kf.serial[other] == 0 or kf.serial[other] >= kf.serial[k] - 1:
-                    continue
-                if redundancy(atlas.points, kf, int(other)) > _REDUNDANT:
-                    self.retire(int(other))
-
-    def _thin(self) -> None:
-        """Look once at each keyframe when it has fallen far behind: there a thinner map will do."""
-        with self.step():
-            slots = self.atlas.slots
-            if len(slots) <= _BEHIND + 1:
-                return
-            before, old, after = (int(s) for s in slots[-_BEHIND - 1 : -_BEHIND + 2])
-            kf = self.atlas.keyframes
-            distance_m, angle_rad = moved(kf.R[before], kf.t[before], kf.R[after], kf.t[after])
-            close = distance_m < _CLOSE_M and angle_rad < _CLOSE_RAD
-            enough = _REDUNDANT_CLOSE if close else _REDUNDANT_BEHIND
-            if kf.serial[old] and redundancy(self.atlas.points, kf, old) > enough:
-                self.retire(old)
-
-    def retire(self, k: int) -> None:
-        """Take a keyframe out of the map, remembering where it stood relative to its nearest relative."""
-        atlas = self.atlas
-        kf = atlas.keyframes
-        standin = neighbours(atlas, k, 1, 1)
-        if not len(standin):
-            return
-        s = int(standin[0])
-        relative = pose(kf.R[s], kf.t[s]) @ inverse(pose(kf.R[k], kf.t[k]))
-        self.retired[int(kf.serial[k])] = (int(kf.serial[s]), relative)
-        remove_keyframe(atlas.points, kf, k)
-
-    def keyframe_pose(self, serial: int) -> F64:
-        """Return T_map_keyframe (4, 4) of a keyframe that lives, or lived.
-
-        Raises:
-            KeyError: for a serial that never was.
-        """
-        relative = np.eye(4)
-        while serial in self.retired:
-            serial, step = self.retired[serial]
-            relative = step @ relative
-        k = self.atlas.slot_of(serial)
-        if k < 0:
-            raise KeyError(f"no keyframe {serial}")
-        return inverse(pose(self.atlas.keyframes.R[k], self.atlas.keyframes.t[k])) @ relative
 
 
 def _span_m(R: F64, t: F64) -> float:

@@ -27,8 +27,9 @@ from services.slam.lag import Lag
 from services.slam.links import shared_counts
 from services.slam.loops import Loops
 from services.slam.mapping import Mapping
-from services.slam.motion import STILL, Motion, Velocity, can_have_moved
+from services.slam.motion import STILL, Motion, Velocity
 from services.slam.places import Places
+from services.slam.relocation import Relocation, step_between
 from services.slam.results import GraphUpdate, NewKeyframe, TrackResult, map_covariance
 from services.slam.shutter import Shutter
 from services.slam.tracking import Tracked, Tracking, moved
@@ -77,8 +78,7 @@ class Slam:
         self.shutter = Shutter(self.atlas, camera)
         self._lag = Lag(intrinsics, camera, config, self._extractor.depth_noise)
         self._verifier = Verifier(intrinsics, camera)
-        self._found: tuple[int, Tracked] | None = None
-        """Stamp and frame of a place found blind that waits for a second frame to say the same."""
+        self._relocation = Relocation(self.loops, self._verifier)
         self._reference = -1
         self._anchor: F64 = np.eye(4)
         """T_keyframe_camera of the last tracked frame."""
@@ -176,7 +176,7 @@ class Slam:
         frame = self.tracking.follow(last, features, np.ascontiguousarray(R), predicted[:3, 3].copy())
         if frame is None:
             return None
-        velocity = self._motion.velocity(stamp_ns, _step(last, frame))
+        velocity = self._motion.velocity(stamp_ns, step_between(last, frame))
         self._place(features, velocity)
         joined = self.tracking.join_map(frame, unsure=last.features.smeared)
         if joined is None or joined[0].inliers < self.config.min_inliers:
@@ -185,7 +185,7 @@ class Slam:
             self.mapping.owe()
         self._unroll(joined[0], velocity)
         movers.mark(self.tracking, last, joined[0], self._motion.since_s(stamp_ns))
-        believed = self._motion.plausible(stamp_ns, _step(last, joined[0]))
+        believed = self._motion.plausible(stamp_ns, step_between(last, joined[0]))
         return joined[0] if believed and self._verifier.believes(joined[0], depth_m, blind=False) else None
 
     def _place(self, features: Features, velocity: Velocity) -> None:
@@ -223,20 +223,11 @@ class Slam:
         return self._upright.sigma_rad
 
     def _relocalise(self, stamp_ns: int, features: Features, depth_m: NDArray[np.float32]) -> Tracked | None:
-        """Return the frame located anywhere in the map; that is a jump, and told as one.
-
-        When in doubt it is not believed before a second frame was found where the camera can be by then.
-        """
+        """Return the frame located anywhere in the map; that is a jump, and told as one."""
         self._place(features, STILL)
-        frame = self.loops.relocate(features)
-        if frame is None or not self._verifier.believes(frame, depth_m, blind=True):
-            self._found = None
+        frame = self._relocation.find(stamp_ns, features, depth_m)
+        if frame is None:
             return None
-        before, self._found = self._found, (stamp_ns, frame)
-        again = before is not None and can_have_moved((stamp_ns - before[0]) * 1e-9, _step(before[1], frame))
-        if not again and not self._verifier.sure(frame):
-            return None
-        self._found = None
         if self._taken_up:
             self._taken_up, self.mapping.why = False, "restored"
             self.mapping.revision += 1
@@ -249,7 +240,7 @@ class Slam:
 
     def _accept(self, stamp_ns: int, frame: Tracked, graph: GraphUpdate | None) -> TrackResult:
         """Remember a frame that has its pose, and make a keyframe of it when the map needs one."""
-        self._motion.update(stamp_ns, None if self._last is None else _step(self._last, frame))
+        self._motion.update(stamp_ns, None if self._last is None else step_between(self._last, frame))
         settled = self.shutter.settle(self._motion.measured)
         if settled is not None:
             self._lag.settle(self.atlas.keyframes, *settled, self.shutter.readout_s)
@@ -357,17 +348,8 @@ class Slam:
 
     def keyframe_poses(self) -> dict[int, F64]:
         """Return T_map_camera (4, 4) of each living keyframe by id, in order of id."""
-        kf, slots = self.atlas.keyframes, self.atlas.slots
-        T = np.tile(np.eye(4), (len(slots), 1, 1))
-        T[:, :3, :3] = kf.R[slots].transpose(0, 2, 1)
-        T[:, :3, 3] = -np.einsum("nba,nb->na", kf.R[slots], kf.t[slots])
-        return dict(zip(kf.serial[slots].tolist(), T, strict=True))
+        return self.atlas.keyframe_poses()
 
     def final_trajectory(self) -> list[tuple[int, F64]]:
         """Return (stamp_ns, T_map_camera) of each tracked frame, placed by what is now known of its keyframe."""
         return [] if self._trail is None else self._trail.placed(self.mapping.keyframe_pose)
-
-
-def _step(last: Tracked, frame: Tracked) -> F64:
-    """Return T_last_camera (4, 4) of two located frames."""
-    return pose(last.R, last.t) @ inverse(pose(frame.R, frame.t))

@@ -66,7 +66,7 @@ def warm_mapping() -> None:
     _warm_keeping(slam)
     _warm_large(slam)
     slam.polish()
-    slam.mapping.retire(int(slam.atlas.slots[1]))
+    slam.mapping.thinning.retire(int(slam.atlas.slots[1]))
     slam.final_trajectory()
     _done.add("mapping")
 
