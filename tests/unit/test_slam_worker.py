@@ -266,7 +266,7 @@ def test_what_has_fallen_behind_is_thinned_and_the_way_remains(monkeypatch: pyte
     poses = turn_on_the_spot(26, 52.0)
     counts = []
     for behind in (1000, 6):
-        monkeypatch.setattr("services.slam.mapping._BEHIND", behind)
+        monkeypatch.setattr("services.slam.thinning._BEHIND", behind)
         slam = Slam(INTRINSICS, CONFIG.model_copy(update={"keyframe_ratio": 1.0}))  # a keyframe almost every frame
         results = [slam.track(k * PERIOD_NS, *look(T), np.array([0.0, -9.81, 0.0])) for k, T in enumerate(poses)]
         assert all(r.status == "tracking" for r in results)
