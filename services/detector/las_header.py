@@ -33,6 +33,13 @@ def announced_too_much(path: Path) -> str:
     return _chunks_too_many(path, begin, size) if kind & _COMPRESSED else ""
 
 
+def is_compressed(path: Path) -> bool:
+    """Return whether a file's points are LAZ, whatever its name says."""
+    with path.open("rb") as stream:
+        head = stream.read(105)
+    return len(head) == 105 and bool(head[104] & _COMPRESSED)
+
+
 def _chunks_too_many(path: Path, begin: int, size: int) -> str:
     """Return in words how many chunks a LAZ file announces and cannot hold: room is made for all of them before the first is read.
 

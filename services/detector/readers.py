@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.common.errors import InputError
-from services.detector.las_header import announced_too_much
 from services.detector.model import Views
+from services.detector.readers_las import read_las
 from services.detector.readers_pcd import read_pcd
 from services.detector.readers_ply import read_ply
 
@@ -42,7 +42,7 @@ def read_cloud(path: Path) -> Cloud:
             f"{path}: no such file" if not path.exists() else f"{path}: not a file, a point cloud was expected"
         )
     kind = path.suffix.lower()
-    readers: dict[str, Callable[[Path], Floats]] = {".pcd": read_pcd, ".las": _read_las, ".laz": _read_las}
+    readers: dict[str, Callable[[Path], Floats]] = {".pcd": read_pcd, ".las": read_las, ".laz": read_las}
     readers.update(dict.fromkeys(_TEXT_SUFFIXES, _read_xyz))
     if kind not in readers and kind != ".ply":
         raise InputError(f"{path}: unknown kind {kind or 'without suffix'!r}; ply, pcd, las, laz and xyz are read")
@@ -60,25 +60,6 @@ def read_cloud(path: Path) -> Cloud:
     if views is not None and refused:
         views = replace(views, index=views.index[good])
     return Cloud(np.ascontiguousarray(points[good] if refused else points, dtype=np.float64), refused, views)
-
-
-def _read_las(path: Path) -> Floats:
-    import laspy
-
-    if too_much := announced_too_much(path):
-        raise InputError(f"{path}: not a whole LAS/LAZ file: its header announces {too_much}")
-    try:
-        las = laspy.read(path)
-        expected = int(las.header.point_count)
-        points = np.stack([np.asarray(las.x), np.asarray(las.y), np.asarray(las.z)], axis=1)
-    except (OSError, MemoryError):
-        raise
-    except Exception as error:  # laspy and its decompressor raise many kinds, also bare struct and Rust errors
-        text = " ".join(str(error).split())[:160] or type(error).__name__
-        raise InputError(f"{path}: not a whole LAS/LAZ file: {text}") from error
-    if len(points) < expected:
-        raise InputError(f"{path}: cut short: {len(points)} points of the {expected} its header announces")
-    return points
 
 
 def _read_xyz(path: Path) -> Floats:

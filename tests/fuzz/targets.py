@@ -168,7 +168,7 @@ TARGETS: dict[str, Target] = {
     "cloud ply": Target([seeds.ply()], _file("a.ply", _cloud), _FILE),
     "cloud pcd": Target([seeds.pcd(), seeds.pcd_text()], _file("a.pcd", _cloud), _FILE),
     "cloud las": Target([seeds.las(compressed=False)], _file("a.las", _cloud), _FILE),
-    "cloud laz": Target([seeds.las(compressed=True)], _file("a.laz", _cloud), _FILE),
+    "cloud laz": Target([seeds.las(compressed=True)], _file("a.laz", _cloud), _FILE, slow=5),
     "cloud xyz": Target([seeds.xyz()], _file("a.xyz", _cloud), _FILE),
     "colour image": Target(seeds.images(), lambda data, _: decode_colour_image(data, WIDTH, HEIGHT), (FrameError,)),
     "depth png": Target(seeds.depths()[:1], lambda data, _: decode_depth(data, "png", WIDTH, HEIGHT), (FrameError,)),

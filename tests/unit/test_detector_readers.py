@@ -192,3 +192,20 @@ def test_a_laz_file_that_announces_more_chunks_than_it_holds_is_refused(tmp_path
     path.write_bytes(data)
     with pytest.raises(InputError, match="announces 4294967295 chunks in"):
         read_cloud(path)
+
+
+def test_a_laz_file_whose_decompressor_is_aborted_is_refused(tmp_path: Path) -> None:
+    """Found by fuzzing: with a damaged size of an item the Rust decompressor ends the process that it runs in."""
+    path, data = tmp_path / "cloud.laz", bytearray(las(compressed=True))
+    data[295:297] = b"\xff\xff"
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"cloud\.laz: not a whole LAS/LAZ file"):
+        read_cloud(path)
+
+
+def test_a_decompressor_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "cloud.laz"
+    path.write_bytes(las(compressed=True))
+    monkeypatch.setattr("services.detector.readers_las._PATIENCE_S", 0.01)
+    with pytest.raises(InputError, match="cannot be unpacked"):
+        read_cloud(path)
