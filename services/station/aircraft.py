@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import dataclass, field
 
 from schemas.fleet import HeldState
@@ -16,8 +15,8 @@ from schemas.vehicle import VehicleState
 from services.common.geometry import camera_yaw, from_transform
 from services.station.ages import LinkAges
 from services.station.events import EventKind, EventLevel, EventLog
+from services.station.trail import Trail
 
-_TRAIL_POINTS = 3_000
 _TRAIL_STEP_M = 0.10
 _TRAIL_STEP_RAD = math.radians(8.0)
 _BAD_STATES = frozenset({"failed", "released"})
@@ -29,9 +28,6 @@ CARRIER_WORDS: dict[Carrier, str] = {
     "none": "nothing carries the pose",
 }  # fmt: skip
 _CARRIER_LEVEL: dict[Carrier, EventLevel] = {"camera": "good", "second": "warn", "imu": "warn", "none": "bad"}
-
-TrailPoint = tuple[float, float, float, float]
-"""x and y in map, metres, the heading, radians, and the height, metres."""
 
 
 @dataclass(slots=True)
@@ -53,7 +49,7 @@ class Aircraft:
     trees_version: int = 0
     health: dict[str, Health] = field(default_factory=dict)
     live: set[str] = field(default_factory=set)
-    trail: deque[TrailPoint] = field(default_factory=lambda: deque(maxlen=_TRAIL_POINTS))
+    trail: Trail = field(default_factory=Trail)
     trail_map: str = ""
     map_begun_in_air: bool = False
     """The present map replaced another while the aircraft flew: it does not begin at the start point."""
@@ -80,8 +76,7 @@ class Aircraft:
 
     def _extend_trail(self, place: tuple[float, float, float, float]) -> None:
         x, y, z, yaw = place
-        if self.trail:
-            last = self.trail[-1]
+        if (last := self.trail.newest) is not None:
             turned = abs(math.remainder(yaw - last[2], 2.0 * math.pi))
             if math.hypot(x - last[0], y - last[1]) < _TRAIL_STEP_M and turned < _TRAIL_STEP_RAD:
                 return

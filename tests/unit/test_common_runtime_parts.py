@@ -7,6 +7,8 @@ import logging
 import os
 import resource
 import socket
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -27,6 +29,8 @@ from services.common.logging import Throttle, set_up
 from services.common.memory import Hub
 from services.common.process import give_back_memory, give_way, prepare_process
 from services.common.session import free_port, port_is_free, split_endpoint
+
+ROOT = Path(__file__).parents[2]
 
 
 def test_items_are_taken_in_order_of_arrival_across_mailboxes() -> None:
@@ -202,6 +206,28 @@ def test_what_a_full_queue_held_goes_back_to_the_machine() -> None:
     give_back_memory()
     assert full_mb - _resident_mb() > 80.0
     assert len(last) == 20_000
+
+
+@pytest.mark.parametrize("taken", [True, False])
+def test_arrays_of_many_lengths_take_no_more_memory_once_it_is_taken(*, taken: bool) -> None:
+    grown_mb = float(subprocess.check_output([sys.executable, "-c", _MANY_LENGTHS, str(taken)], cwd=ROOT))
+    assert grown_mb < 1.0 if taken else grown_mb > 2.0, "without it there is growth, or this test shows nothing"
+
+
+_MANY_LENGTHS = """
+import resource, sys
+import numpy as np
+from services.common.process import take_small_arrays
+def resident_mb():
+    return int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize() / 1e6
+lengths = np.random.default_rng(1).integers(1, 1024, (20_000, 8)).tolist()
+if sys.argv[1] == "True":
+    take_small_arrays()
+before = resident_mb()
+for some in lengths:
+    arrays = [np.zeros(n, bool) for n in some]
+print(resident_mb() - before)
+"""
 
 
 def _resident_mb() -> float:

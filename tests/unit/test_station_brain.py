@@ -25,6 +25,7 @@ from services.station.config import StationConfig
 from services.station.outbox import Outbox
 from services.station.preview import frame_of
 from services.station.requests import MAX_BYTES, Hello, Order, parse
+from services.station.trail import Trail
 from tests.unit.navigator_world import tree
 
 SECRET = "a" * 24
@@ -288,6 +289,18 @@ def test_an_older_list_and_an_older_map_do_not_come_back() -> None:
     a.on_pose(pose(1.0))
     a.on_pose(pose(2.0, "m2"))
     assert [point[0] for point in a.trail] == [2.0]
+
+
+def test_a_trail_keeps_the_newest_points_in_order() -> None:
+    trail = Trail(most=3)
+    assert trail.newest is None
+    for x in range(5):
+        trail.append((float(x), 0.5, -0.25, 1.5))
+        assert trail.newest == (x, 0.5, -0.25, 1.5)
+    assert list(trail) == [(x, 0.5, -0.25, 1.5) for x in (2.0, 3.0, 4.0)]
+    assert len(trail) == 3
+    trail.clear()
+    assert list(trail) == []
 
 
 # -- what comes from browsers
