@@ -220,12 +220,12 @@ import numpy as np
 from services.common.process import take_small_arrays
 def resident_mb():
     return int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize() / 1e6
-lengths = np.random.default_rng(1).integers(1, 1024, (20_000, 8)).tolist()
+lengths = np.random.default_rng(1).integers(1, 1024, 20_000).tolist()
 if sys.argv[1] == "True":
     take_small_arrays()
 before = resident_mb()
-for some in lengths:
-    arrays = [np.zeros(n, bool) for n in some]
+for length in lengths:
+    masks = [np.zeros(length, bool) for _ in range(8)]
 print(resident_mb() - before)
 """
 
