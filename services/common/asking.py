@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -44,6 +45,9 @@ class Asking:
                 replies = self._bus.ask(topic, request, kind, timeout_s)
             except zenoh.ZError as error:  # the session is closing, or the router away
                 self._throttle.log(LOG, logging.WARNING, topic.name, f"{topic.name} could not be asked: {error}")
+            except Exception as error:  # noqa: BLE001 - a bug, and no one looks at this thread: the work loop ends with it
+                self._inbox.put(self._box, functools.partial(_fail, error))
+                return
             self._inbox.put(self._box, lambda: then(replies))
 
         self._pool.submit(work)
@@ -51,3 +55,7 @@ class Asking:
     def close(self) -> None:
         """Ask nothing more."""
         self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _fail(error: Exception) -> None:
+    raise error
