@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import os
 import re
 import resource
 import shutil
@@ -15,11 +14,11 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
 import units
 from actions import Action, Folder, InstallError, Link, Remove, Run, Write
+from checks import MARK, check, kept_name
 
 SOURCE = Path(__file__).resolve().parents[1]
 USER = "treedock"
@@ -31,11 +30,11 @@ COMMAND = "usr/local/bin/treedock"
 MEMORY_LOCK = f"{UNIT_FOLDER}/treedock-.service.d/10-memory-lock.conf"
 BOOTED = Path("/run/systemd/system")
 """There while systemd runs this machine (man sd_booted)."""
-STAMP = "share/treedock/source.sha256"
+STAMP = f"{MARK}/source.sha256"
 """Below the prefix: what was installed, by its bytes."""
 KERNELS = f"var/cache/{USER}/numba"
 RULES = "etc/udev/rules.d/60-treedock.rules"
-_MIN_PYTHON = (3, 11)
+_UAV = "uav1"
 _CAP_IPC_LOCK = 1 << 14
 
 
@@ -52,6 +51,8 @@ class Options:
     enable: bool
     purge: bool
     no_realsense: bool
+    named: bool
+    """The aircraft's name was given, and is not the default."""
 
     def at(self, path: str) -> Path:
         """Return where a path of the installed system lies under ``--root``."""
@@ -124,6 +125,7 @@ def _libraries() -> Iterator[Action]:
 def _environment(options: Options) -> Iterator[Action]:
     prefix = options.at(options.prefix)
     python = str(prefix / "bin/python")
+    yield Folder(prefix / MARK)  # first of all: also what is left of an attempt that broke off is known as ours
     yield Run((sys.executable, "-m", "venv", str(prefix)), "a private environment", needed=not Path(python).exists())
     offline = ("--no-index", "--find-links", str(options.wheels)) if options.wheels else ()
     stamp, wanted = prefix / STAMP, source_hash()
@@ -204,50 +206,13 @@ def _without(file: Path) -> Action:
     return Remove(file.parent if alone else file)
 
 
-def check(options: Options) -> None:
-    """Refuse what cannot work before anything is touched.
-
-    Raises:
-        InstallError: with what to do.
-    """
-    if sys.version_info < _MIN_PYTHON:
-        raise InstallError(
-            f"Python {sys.version.split()[0]} is too old, 3.11 is needed: PYTHON=python3.11 deploy/install"
-        )
-    home = home_of(Path(sys.executable))
-    if options.live and home:
-        raise InstallError(
-            f"this Python lies in {home}, where the services' user may not look: PYTHON=/usr/bin/python3 deploy/install"
-        )
-    if find_spec("ensurepip") is None:
-        raise InstallError("this Python cannot make environments: apt-get install python3-venv")
-    if not options.prefix.startswith("/"):
-        raise InstallError(f"--prefix {options.prefix}: expected an absolute path, for example /opt/treedock")
-    if options.live and not options.dry_run and os.geteuid() != 0:
-        raise InstallError("this writes to /etc and /opt: run it with sudo, or look first with --dry-run")
-    if options.live and not options.dry_run and shutil.which("systemctl") is None:
-        raise InstallError("systemctl is not here: treedock runs as systemd units")
-    allowed = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-")
-    if not options.uav or not set(options.uav) <= allowed:
-        raise InstallError(f"--uav {options.uav!r}: letters, digits, _ and - make an aircraft's name")
-
-
-def home_of(python: Path) -> str:
-    """Return the home folder that a Python (or what its links lead to) lies in, empty when it is the system's."""
-    for place in (python.absolute(), python.resolve()):
-        for home in ("/root", "/home", "/Users"):
-            if place.is_relative_to(home):
-                return home
-    return ""
-
-
 def parse(arguments: Sequence[str]) -> tuple[str, Options]:
     """Return the verb and the options."""
     parser = argparse.ArgumentParser(prog="deploy/install", description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("verb", nargs="?", choices=("install", "uninstall"), default="install")
     parser.add_argument("--prefix", default=units.PREFIX, help="place of the private environment (default %(default)s)")
     parser.add_argument("--root", type=Path, default=Path("/"), help="stage below this folder instead of installing")
-    parser.add_argument("--uav", default="uav1", help="the aircraft's name, a part of every key (default %(default)s)")
+    parser.add_argument("--uav", help=f"the aircraft's name, a part of every key (default {_UAV})")
     parser.add_argument(
         "--role",
         choices=("aircraft", "station"),
@@ -263,15 +228,16 @@ def parse(arguments: Sequence[str]) -> tuple[str, Options]:
     )
     given = parser.parse_args(arguments)
     return given.verb, Options(
-        given.prefix,
+        given.prefix.rstrip("/") or "/",
         given.root.absolute(),
-        given.uav,
+        _UAV if given.uav is None else given.uav,
         given.role,
         given.dry_run,
         given.wheels,
         given.enable,
         given.purge,
         given.no_realsense,
+        given.uav is not None,
     )
 
 
@@ -279,7 +245,7 @@ def main(arguments: Sequence[str]) -> int:
     """Install or uninstall; 0 done, 2 something is to be mended first."""
     verb, options = parse(arguments)
     try:
-        check(options)
+        check(verb, options)
         for action in installation(options) if verb == "install" else removal(options):
             sys.stdout.write(action.describe() + "\n")
             sys.stdout.flush()
@@ -288,6 +254,8 @@ def main(arguments: Sequence[str]) -> int:
     except (InstallError, OSError) as error:
         sys.stderr.write(f"deploy/install: {error}\n")
         return 2
+    if verb == "install" and options.named and (other := kept_name(options.at(CONFIG), options.uav)):
+        sys.stdout.write(f"note: {other}\n")
     if verb == "install" and not options.dry_run and not options.enable and options.live:
         target = TARGET_OF[options.role]
         sys.stdout.write(f"installed; look at {options.at(CONFIG)}, then: systemctl enable --now {target}\n")

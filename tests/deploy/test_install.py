@@ -20,6 +20,7 @@ ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "deploy"))
 
 import actions  # noqa: E402 - lies beside the script that runs before anything is installed
+import checks  # noqa: E402
 import installer  # noqa: E402
 import units  # noqa: E402
 
@@ -261,7 +262,7 @@ def test_the_command_is_found_by_name_and_nobody_elses_is_touched(tmp_path: Path
     ],
 )
 def test_a_python_that_the_services_may_not_read_is_known(python: str, home: str) -> None:
-    assert installer.home_of(Path(python)) == home
+    assert checks.home_of(Path(python)) == home
 
 
 @pytest.mark.parametrize(("bounding", "needed"), [("0000000000004000", True), ("0000000000000000", False)])
@@ -320,7 +321,47 @@ def test_uninstall_leaves_no_empty_folder_and_no_drop_in_of_others(tmp_path: Pat
     assert ours.parent.exists() == own
 
 
-@pytest.mark.parametrize("arguments", [["--uav", "a b"], ["--uav", ""], ["--prefix", "opt"], ["--uav", "x/../y"]])
+@pytest.mark.parametrize("prefix", ["/", "/usr", "/usr/../usr", "/usr/"])
+@pytest.mark.parametrize("verb", ["install", "uninstall"])
+def test_a_folder_that_the_installer_did_not_make_is_never_taken(
+    tmp_path: Path, verb: str, prefix: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    theirs = tmp_path / "usr/bin/python"
+    theirs.parent.mkdir(parents=True)
+    theirs.touch()
+    assert installer.main([verb, "--root", str(tmp_path), "--prefix", prefix]) == 2
+    assert theirs.exists()
+    assert capsys.readouterr().err.startswith("deploy/install: --prefix /")
+
+
+def test_what_an_attempt_left_that_broke_off_is_known_as_ours(tmp_path: Path) -> None:
+    first, *_ = installer.installation(options(tmp_path))
+    first.do()
+    (tmp_path / "opt/treedock/bin").mkdir()
+    assert installer.main(["--dry-run", "--root", str(tmp_path)]) == 0
+    assert installer.main(["uninstall", "--root", str(tmp_path)]) == 0
+    assert not (tmp_path / "opt/treedock").exists()
+
+
+@pytest.mark.parametrize("prefix", ["/home/eve/treedock", "/root/treedock", "/tmp/treedock"])
+def test_where_the_services_see_nothing_is_no_place(prefix: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert installer.main(["--dry-run", "--prefix", prefix]) == 2
+    assert "the services see nothing of" in capsys.readouterr().err
+
+
+def test_a_name_that_changes_nothing_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    staged(tmp_path, "--uav", "kea")
+    for arguments, told in ([], False), (["--uav", "kea"], False), (["--uav", "tui"], True):
+        assert installer.main(["--dry-run", "--root", str(tmp_path), *arguments]) == 0
+        assert ("says uav = 'kea', not 'tui'" in capsys.readouterr().out) == told
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["--uav", "a b"], ["--uav", ""], ["--uav", "x/../y"], ["--uav", "x" * 65], ["--uav", "station"],
+     ["--prefix", "opt"], ["--prefix", "/opt/tree dock"], ["--prefix", "/opt/50%n"],
+     ["--wheels", "/nowhere"], ["--purge"]],
+)  # fmt: skip
 def test_what_cannot_work_is_refused_first(
     tmp_path: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
