@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from services.security.authority import Authority
+    from services.security.identity import Identity
 
 certs_app = typer.Typer(
     help="Certificates: one authority for the fleet, one certificate per service and station.", no_args_is_help=True
@@ -24,7 +25,7 @@ Folder = Annotated[Path, typer.Option("--folder", help="The authority's folder; 
 Names = Annotated[
     list[str], typer.Argument(help="Identities: uav1.slam, station.alice; uav1.all for a whole aircraft.")
 ]
-Days = Annotated[int, typer.Option("--days", min=1, help="Validity of the certificates.")]
+Days = Annotated[int, typer.Option("--days", min=1, max=36500, help="Validity of the certificates.")]
 Hosts = Annotated[
     list[str] | None,
     typer.Option("--host", help="Address under which nodes reach the router; may be given again."),
@@ -47,8 +48,8 @@ def init(*, folder: Folder = _FOLDER) -> None:
 def issue(names: Names, *, folder: Folder = _FOLDER, days: Days = _DAYS, host: Hosts = None) -> None:
     """Issue certificates; one that an identity holds already is revoked."""
     authority = _opened(folder)
-    for name in _expanded(names):
-        authority = _issue(authority, name, days, host)
+    for identity in _expanded(names):
+        authority = _issue(authority, identity, days, host)
     typer.echo(_next_step(folder))
 
 
@@ -58,23 +59,26 @@ def renew(names: Names, *, folder: Folder = _FOLDER, days: Days = _DAYS, host: H
     from services.common.errors import InputError
 
     authority = _opened(folder)
-    for name in _expanded(names, authority):
-        last = next((e for e in reversed(authority.register.entries) if e.identity == name), None)
-        if last is None:
-            raise InputError(f"{name}: nothing was issued yet; `treedock certs issue {name}` does it")
-        authority = _issue(authority, name, days, host or list(last.hosts))
+    identities = _expanded(names, authority)
+    hosts = {entry.identity: entry.hosts for entry in authority.register.entries}  # of the latest
+    new = [identity.text for identity in identities if identity.text not in hosts]
+    if new:
+        raise InputError(f"{new[0]}: nothing was issued yet; `treedock certs issue {new[0]}` does it")
+    for identity in identities:
+        authority = _issue(authority, identity, days, host or hosts[identity.text])
     typer.echo(_next_step(folder))
 
 
 @certs_app.command("revoke")
 def revoke(names: Names, *, folder: Folder = _FOLDER) -> None:
     """Take all rights from identities; routers refuse them once they have the new list."""
-    from services.security.identity import Identity
-
     authority = _opened(folder)
-    for name in _expanded(names, authority):
-        authority = authority.revoke(Identity.parse(name))
-        typer.echo(f"{name}: revoked")
+    identities = _expanded(names, authority)
+    for identity in identities:  # all or nothing: a mistyped name is noticed before the first is revoked
+        authority.holding(identity)
+    for identity in identities:
+        authority = authority.revoke(identity)
+        typer.echo(f"{identity.text}: revoked")
     typer.echo(
         f"bring the new {folder / 'identities.json'} to every router's machine (certs export and import, or copy it to "
         "/etc/treedock/certs): the router there takes it within seconds"
@@ -110,10 +114,8 @@ def export(
     folder: Folder = _FOLDER,
 ) -> None:
     """Copy what a machine with these nodes needs; never the authority's key."""
-    from services.security.identity import Identity
-
     authority = _opened(folder)
-    files = authority.export([Identity.parse(name) for name in _expanded(names, authority)], to)
+    files = authority.export(_expanded(names, authority), to)
     typer.echo(f"{len(files)} files in {to}; on the machine they are for: sudo treedock certs import THAT_FOLDER")
 
 
@@ -139,31 +141,41 @@ def _opened(folder: Path) -> Authority:
     return Authority.open(folder)
 
 
-def _issue(authority: Authority, name: str, days: int, hosts: Sequence[str] | None) -> Authority:
-    from services.security.identity import Identity
-
-    authority = authority.issue(Identity.parse(name), _now(), days, tuple(hosts or ("127.0.0.1", "localhost")))
-    typer.echo(f"{name}: valid until {authority.register.entries[-1].valid_until[:10]}")
+def _issue(authority: Authority, identity: Identity, days: int, hosts: Sequence[str] | None) -> Authority:
+    authority = authority.issue(identity, _now(), days, tuple(hosts or ("127.0.0.1", "localhost")))
+    typer.echo(f"{identity.text}: valid until {authority.register.entries[-1].valid_until[:10]}")
     return authority
 
 
-def _expanded(names: Sequence[str], authority: Authority | None = None) -> list[str]:
-    """Return the identities, with ``uav1.all`` replaced by the aircraft's services (those issued, when there is a list)."""
-    from services.cli.service_command import OPTIONAL, SERVICES
-    from services.security.identity import READER
+def _expanded(names: Sequence[str], authority: Authority | None = None) -> list[Identity]:
+    """Return the identities, with ``uav1.all`` replaced by the aircraft's services (those that hold one, by a list).
+
+    Raises:
+        InputError: a name is none, or stands for nothing: told before the first certificate is touched.
+    """
+    from services.security.identity import Identity
 
     found: list[str] = []
     for name in names:
-        uav, dot, role = name.partition(".")
-        if not (dot and role == "all"):
-            found.append(name)
-        elif authority is None:
-            aboard = [service for service in (*SERVICES, *OPTIONAL) if service not in {"simulator", "station"}]
-            found += [f"{uav}.{service}" for service in (*aboard, READER)]
-        else:
-            held = {e.identity for e in authority.register.entries if not e.revoked}
-            found += sorted(identity for identity in held if identity.startswith(f"{uav}."))
-    return list(dict.fromkeys(found))
+        first, dot, role = name.partition(".")
+        found += _all_of(first, authority) if dot and role == "all" else [name]
+    return [Identity.parse(name) for name in dict.fromkeys(found)]
+
+
+def _all_of(first: str, authority: Authority | None) -> list[str]:
+    from services.cli.service_command import OPTIONAL, SERVICES
+    from services.common.errors import InputError
+    from services.security.identity import READER, STATION
+
+    if authority is None:
+        if first == STATION:  # each would be a station of that name, with the right to command every aircraft
+            raise InputError("station.all: name each station, for example station.alice")
+        aboard = [service for service in (*SERVICES, *OPTIONAL) if service not in {"simulator", "station"}]
+        return [f"{first}.{service}" for service in (*aboard, READER)]
+    held = {e.identity for e in authority.register.entries if not e.revoked and e.identity.startswith(f"{first}.")}
+    if not held:
+        raise InputError(f"{first}.all: nothing of {first} holds a valid certificate; `treedock certs list` shows them")
+    return sorted(held)
 
 
 def _next_step(folder: Path) -> str:

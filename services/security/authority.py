@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import datetime as dt
 import ipaddress
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,8 @@ from services.security.register import Issued, Register
 CA_CERTIFICATE, CA_KEY = "ca.pem", "ca.key"
 CA_DAYS = 3650
 NODE_DAYS = 397
+_HOST_NAME = re.compile(r"(?!.{254})(?![0-9.]+\Z)[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*\Z")
+"""What consists of digits and points alone is an address that was mistyped."""
 _BACKDATED = dt.timedelta(minutes=5)
 """A companion computer's clock may be a little behind the authority's."""
 
@@ -95,9 +98,14 @@ class Authority:
         Raises:
             InputError: the authority itself ends earlier, or the folder cannot be written.
         """
-        if now + dt.timedelta(days=days) > self.certificate.not_valid_after_utc:
-            last = self.certificate.not_valid_after_utc
-            raise InputError(f"{identity.text}: {days} days go beyond the authority's own end ({last:%Y-%m-%d})")
+        last = self.certificate.not_valid_after_utc
+        if now + dt.timedelta(days=days) > last:
+            left = (last - now).days
+            do = f"--days {left} at most, or " if left > 0 else ""
+            raise InputError(
+                f"{identity.text}: {days} days go beyond the authority's own end ({last:%Y-%m-%d}): {do}make a new one "
+                "(`treedock certs init --folder ANOTHER`), and issue all certificates anew there"
+            )
         generation = self.register.next_generation(identity.text)
         common_name = f"{identity.text}.{generation}"
         key = ec.generate_private_key(ec.SECP256R1())
@@ -127,9 +135,17 @@ class Authority:
         Raises:
             InputError: none is valid, or the folder cannot be written.
         """
+        self.holding(identity)
+        return self._with(self.register.revoked(identity.text))
+
+    def holding(self, identity: Identity) -> None:
+        """Refuse an identity without rights.
+
+        Raises:
+            InputError: it holds no certificate, or none that is not revoked.
+        """
         if not any(e.identity == identity.text and not e.revoked for e in self.register.entries):
             raise InputError(f"{identity.text}: no valid certificate was issued; `treedock certs list` shows them")
-        return self._with(self.register.revoked(identity.text))
 
     def _with(self, register: Register) -> Authority:
         register.write(self.folder)
@@ -139,8 +155,11 @@ class Authority:
         """Copy to ``folder`` what a machine with these nodes needs; never the authority's key. Returns the files.
 
         Raises:
-            InputError: a pair was not issued, or the folder cannot be written.
+            InputError: a pair was not issued or is revoked, or the folder cannot be written.
         """
+        identities = list(identities)
+        for identity in identities:
+            self.holding(identity)
         make_folder(folder, 0o700)
         pairs = [f"{identity.text}{end}" for identity in identities for end in (".pem", ".key")]
         files = []
@@ -179,6 +198,8 @@ def _host(text: str) -> x509.GeneralName:
     try:
         return x509.IPAddress(ipaddress.ip_address(text))
     except ValueError:
+        if not _HOST_NAME.match(text):
+            raise InputError(f"--host {text!r}: expected an address (10.0.0.7) or a name (kea.local)") from None
         return x509.DNSName(text)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import datetime as dt
 import os
+from collections.abc import Collection
 from pathlib import Path
 
 from cryptography import x509
@@ -24,20 +25,23 @@ def bring(source: Path, to: Path, now: dt.datetime) -> list[Path]:
     The files belong to the folder's owner afterwards (the services' user), also when an administrator brings them.
 
     Raises:
-        InputError: something is missing, damaged, expired, revoked or of another authority; nothing was copied then.
+        InputError: something is missing, damaged, expired, revoked or of another authority, or older than what the machine
+            has; nothing was copied then.
     """
     if (source / CA_KEY).exists():
         raise InputError(
             f"{source / CA_KEY}: the authority's own key may not leave its folder; `treedock certs export` leaves it out"
         )
     authority = _certificate(source / CA_CERTIFICATE)
-    valid = Register.read(source).valid_names()
+    register = Register.read(source)
+    valid = register.valid_names()
     names = [CA_CERTIFICATE, Register.FILE]
     for path in sorted(source.glob("*.pem")):
         if path.name == CA_CERTIFICATE:
             continue
         _check(path, authority, valid, now)
         names += [path.name, path.with_suffix(".key").name]
+    _check_later(to, authority, register, names, source)
     make_folder(to, 0o700)
     owner = to.stat()
     files = []
@@ -47,6 +51,32 @@ def bring(source: Path, to: Path, now: dt.datetime) -> list[Path]:
             os.chown(to / name, owner.st_uid, owner.st_gid)
         files.append(to / name)
     return files
+
+
+def _check_later(
+    to: Path, authority: x509.Certificate, register: Register, names: Collection[str], source: Path
+) -> None:
+    """Refuse a list that would give revoked certificates their rights back, or leave pairs that nobody here believes."""
+    try:
+        same = _certificate(to / CA_CERTIFICATE) == authority
+        had = Register.read(to).entries
+    except InputError:  # nothing is there yet, or it is damaged: whatever comes is better
+        return
+    away = f"export it again, or move {to} away first"
+    if not same:
+        left = sorted(path.name for path in to.glob("*.pem") if path.name not in names)
+        if left:
+            raise InputError(
+                f"{source / CA_CERTIFICATE}: is another authority than {to / CA_CERTIFICATE}, and {', '.join(left)} "
+                f"there would fit no more: export those with it, or move {to} away first"
+            )
+        return
+    brought = {entry.common_name: entry.revoked for entry in register.entries}
+    for entry in had:
+        if entry.revoked and brought.get(entry.common_name) is False:
+            raise InputError(f"{source / Register.FILE}: is old, {entry.common_name} was revoked since; {away}")
+        if entry.common_name not in brought:
+            raise InputError(f"{source / Register.FILE}: is old, {entry.common_name} was issued since; {away}")
 
 
 def _check(path: Path, authority: x509.Certificate, valid: dict[str, Identity], now: dt.datetime) -> None:
@@ -60,6 +90,8 @@ def _check(path: Path, authority: x509.Certificate, valid: dict[str, Identity], 
     name = str(certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)[0].value)
     if name not in valid:
         raise InputError(f"{path}: {name} is revoked or not in {Register.FILE}; export it again")
+    if valid[name].text != path.stem:
+        raise InputError(f"{path}: is the certificate of {valid[name].text}; export {path.stem} again")
     key = path.with_suffix(".key")
     try:
         private = serialization.load_pem_private_key(key.read_bytes(), password=None)

@@ -130,8 +130,10 @@ def test_an_authority_is_never_made_twice_nor_outlived(tmp_path: Path) -> None:
     authority = Authority.create(tmp_path, NOW, days=100)
     with pytest.raises(InputError, match="already holds"):
         Authority.create(tmp_path, NOW)
-    with pytest.raises(InputError, match="2027-02-09"):
+    with pytest.raises(InputError, match=r"2027-02-09.*--days 100 at most"):
         authority.issue(Identity.parse("uav1.slam"), NOW, days=101)
+    with pytest.raises(InputError, match=r"own end \(2027-02-09\): make a new one"):
+        authority.issue(Identity.parse("uav1.slam"), NOW + dt.timedelta(days=200), days=1)
 
 
 @pytest.mark.parametrize(
@@ -180,3 +182,37 @@ def test_the_command_line_walks_through(tmp_path: Path, capsys: pytest.CaptureFi
     assert (tmp_path / "m/uav1.slam.key").exists()
     assert invoke(["certs", "issue", "uav1.pilot", *at]) == 2
     assert invoke(["certs", "list", "--folder", str(tmp_path / "nowhere")]) == 2
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Path:
+    """An authority that knows one aircraft's slam and a station."""
+    for arguments in (["init"], ["issue", "uav1.slam", "station.alice"]):
+        assert invoke(["certs", *arguments, "--folder", str(tmp_path / "fleet")]) == 0
+    return tmp_path / "fleet"
+
+
+@pytest.mark.parametrize("arguments", [
+    ["revoke", "uav9.all"], ["renew", "uav9.all"], ["export", "uav9.all", "--to", "TO"], ["issue", "station.all"],
+    ["revoke", "station.alice", "station.bob"], ["renew", "uav1.slam", "uav1.camera"], ["issue", "uav1.slam", "nonsense"],
+    ["issue", "uav1.slam", "--host", ""], ["issue", "uav1.slam", "--host", "two words"], ["issue", "uav1.slam", "--host", "10.0.0"],
+    ["issue", "uav1.slam", "--host", "m\u00fcnchen"], ["issue", "uav1.slam", "--days", "99999999999"],
+])  # fmt: skip
+def test_what_cannot_be_done_whole_is_refused_and_nothing_is_done(
+    fleet: Path, tmp_path: Path, arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {path: path.read_bytes() for path in fleet.iterdir()}
+    capsys.readouterr()
+    given = [str(tmp_path / "to") if argument == "TO" else argument for argument in arguments]
+    assert invoke(["certs", *given, "--folder", str(fleet)]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("treedock: ")
+    assert {path: path.read_bytes() for path in fleet.iterdir()} == before
+    assert not (tmp_path / "to").exists()
+
+
+def test_what_was_revoked_is_not_exported(fleet: Path, tmp_path: Path) -> None:
+    assert invoke(["certs", "revoke", "station.all", "--folder", str(fleet)]) == 0
+    assert invoke(["certs", "export", "station.alice", "--folder", str(fleet), "--to", str(tmp_path / "to")]) == 2
+    assert not (tmp_path / "to").exists()

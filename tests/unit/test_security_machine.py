@@ -15,6 +15,7 @@ from services.common.errors import InputError
 from services.security.authority import Authority
 from services.security.identity import Identity
 from services.security.machine import bring
+from services.security.register import Register
 
 NOW = dt.datetime(2026, 11, 1, tzinfo=dt.UTC)
 SLAM, CAMERA = Identity.parse("uav1.slam"), Identity.parse("uav1.camera")
@@ -78,6 +79,44 @@ def test_an_unsound_set_is_refused_and_nothing_changes(
     with pytest.raises(InputError, match=words):
         bring(stick, tmp_path / "certs", NOW)
     assert not (tmp_path / "certs").exists()
+
+
+def _renamed(stick: Path) -> None:
+    for end in (".pem", ".key"):
+        shutil.copy(stick / f"uav1.camera{end}", stick / f"uav1.slam{end}")
+
+
+def test_a_certificate_under_another_name_is_refused(stick: Path, tmp_path: Path) -> None:
+    _renamed(stick)
+    with pytest.raises(InputError, match=r"uav1\.slam\.pem: is the certificate of uav1\.camera"):
+        bring(stick, tmp_path / "certs", NOW)
+
+
+def test_an_old_stick_gives_no_revoked_certificate_its_rights_back(stick: Path, tmp_path: Path) -> None:
+    fleet, certs = tmp_path / "fleet", tmp_path / "certs"
+    alice = Identity.parse("station.alice")
+    authority = Authority.open(fleet).issue(alice, NOW)
+    authority.export([SLAM], tmp_path / "before")
+    authority.revoke(alice).export([SLAM], tmp_path / "after")
+    bring(tmp_path / "after", certs, NOW)
+    bring(tmp_path / "after", certs, NOW)
+    for old, words in ((tmp_path / "before", "revoked since"), (stick, "issued since")):
+        with pytest.raises(InputError, match=rf"{old / 'identities.json'}: is old, station\.alice\.1 was {words}"):
+            bring(old, certs, NOW)
+        assert "station.alice.1" not in Register.read(certs).valid_names()
+    (certs / Register.FILE).write_text("damaged")
+    bring(tmp_path / "after", certs, NOW)
+
+
+def test_another_authority_leaves_no_pair_behind_that_nobody_believes(stick: Path, tmp_path: Path) -> None:
+    certs = tmp_path / "certs"
+    bring(stick, certs, NOW)
+    other = Authority.create(tmp_path / "other", NOW).issue(SLAM, NOW).issue(CAMERA, NOW)
+    other.export([SLAM], tmp_path / "half")
+    with pytest.raises(InputError, match=r"another authority .*, and uav1\.camera\.pem there"):
+        bring(tmp_path / "half", certs, NOW)
+    other.export([SLAM, CAMERA], tmp_path / "whole")
+    assert bring(tmp_path / "whole", certs, NOW)
 
 
 def test_what_has_expired_is_refused(stick: Path, tmp_path: Path) -> None:
