@@ -6,6 +6,7 @@ import ast
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,12 @@ ADDRESS_OR_MACHINE_PATH = re.compile(
     r"pypi\s*[.]\s*\w+|pythonhosted|(?:extra-)?index-url\b|(?<![\w.])/(?:work|root)/\w|(?<![\w.])/tmp/(?:lead|missions|bash)"
 )
 """Of package indexes, and of the machine it was written on."""
+PACKAGE_OF = {
+    "cv2": "opencv-python-headless", "google": "protobuf", "mcap_protobuf": "mcap-protobuf-support", "open3d": "open3d-cpu",
+    "psycopg": "psycopg", "rerun": "rerun-sdk", "serial": "pyserial", "zenoh": "eclipse-zenoh",
+    "matplotlib": "evo",  # a bench's figures alone; comes with it
+}  # fmt: skip
+"""Modules that are not called as the package that brings them."""
 FORBIDDEN_IN_CORE = ("zenoh", "services.common.context", "services.common.bus", "services.common.runtime", "open3d")
 
 
@@ -38,6 +45,29 @@ def loaded_by(code: str) -> set[str]:
     report = f"{code}\nimport sys\nprint(' '.join(m for m in {HEAVY!r} if m in sys.modules))"
     result = subprocess.run([sys.executable, "-c", report], cwd=ROOT, capture_output=True, text=True, check=True)
     return set(result.stdout.split())
+
+
+def test_every_package_that_is_used_is_a_declared_one() -> None:
+    """Also those that are imported late: what only a real aircraft needs no other test would miss."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    wanted = [
+        *project["dependencies"],
+        *(name for extra in project["optional-dependencies"].values() for name in extra),
+    ]
+    declared = {re.split(r"[^a-z0-9-]", name.lower())[0] for name in wanted}
+    used = {
+        name.split(".")[0]: path
+        for folder in ("schemas", "services")
+        for path in sorted((ROOT / folder).rglob("*.py"))
+        for name in imported(path)
+    }
+    ours = {"schemas", "services", "tests", *sys.stdlib_module_names}
+    missing = {
+        name: str(path.relative_to(ROOT))
+        for name, path in used.items()
+        if name not in ours and PACKAGE_OF.get(name, name.replace("_", "-")) not in declared
+    }
+    assert not missing
 
 
 def test_schemas_load_nothing_heavy() -> None:

@@ -343,7 +343,7 @@ def test_what_an_attempt_left_that_broke_off_is_known_as_ours(tmp_path: Path) ->
     assert not (tmp_path / "opt/treedock").exists()
 
 
-@pytest.mark.parametrize("prefix", ["/home/eve/treedock", "/root/treedock", "/tmp/treedock"])
+@pytest.mark.parametrize("prefix", ["/home/eve/treedock", "/run/user/1000/treedock", "/tmp/treedock"])
 def test_where_the_services_see_nothing_is_no_place(prefix: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert installer.main(["--dry-run", "--prefix", prefix]) == 2
     assert "the services see nothing of" in capsys.readouterr().err

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import pty
 import socket
 from collections.abc import Iterator
 
 import pytest
 from pymavlink.dialects.v20 import common as mav
 
-from services.navigator.autopilot.wire import PEER_SILENT_S, UdpWire
+from services.common.errors import InputError
+from services.navigator.autopilot.wire import PEER_SILENT_S, UdpWire, open_wire
 
 
 class Time:
@@ -80,3 +82,26 @@ def test_an_autopilot_that_fell_silent_may_come_back_from_elsewhere(wire: UdpWir
         assert wire.read() == heartbeat()
         wire.write(b"setpoint")
         assert hears(after)
+
+
+def test_a_serial_line_carries_bytes_both_ways_and_tells_when_it_is_pulled() -> None:
+    pytest.importorskip("serial")
+    autopilot, ours = pty.openpty()
+    wire = open_wire(f"serial:{os.ttyname(ours)}:921600")
+    try:
+        wire.write(b"there")
+        assert os.read(autopilot, 16) == b"there"
+        os.write(autopilot, b"back")
+        got = wire.read()
+        while len(got) < 4:
+            got += wire.read()
+        assert got == b"back"
+        assert wire.read() == b""
+        os.close(autopilot)
+        with pytest.raises(OSError, match=r"\S"):
+            wire.read()
+    finally:
+        wire.close()
+        os.close(ours)
+    with pytest.raises(InputError, match=r"serial:/dev/nowhere:57600.*No such file"):
+        open_wire("serial:/dev/nowhere:57600")

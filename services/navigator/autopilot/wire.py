@@ -118,7 +118,9 @@ class SerialWire:
         try:
             import serial  # type: ignore[import-untyped, unused-ignore]
         except ImportError as error:
-            raise InputError(f"serial:{device}: the package pyserial is missing: pip install pyserial") from error
+            raise InputError(
+                f"serial:{device}: the package pyserial is missing: run deploy/install (or make setup) again"
+            ) from error
         self._port = serial.Serial(device, baud, timeout=WAIT_S, write_timeout=WAIT_S)
 
     def read(self) -> bytes:
