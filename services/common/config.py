@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from services.camera.config import CameraConfig
 from services.cli.run_config import SupervisorConfig
@@ -57,6 +57,14 @@ class TreedockConfig(BaseModel):
     navigator: NavigatorConfig = Field(default_factory=NavigatorConfig)
     autopilot: AutopilotConfig = Field(default_factory=AutopilotConfig)
     station: StationConfig = StationConfig()
+
+    @field_validator("uav")
+    @classmethod
+    def _not_the_grounds(cls, name: str) -> str:
+        """Certificates ``station.NAME`` command every aircraft: this one's services would hold such."""
+        if name == "station":
+            raise ValueError("certificates of that name are the ground stations': give the aircraft another")
+        return name
 
     @model_validator(mode="after")
     def _encrypted_or_plain(self) -> TreedockConfig:

@@ -175,14 +175,18 @@ def _unknown(key: str, known: list[str]) -> str:
 
 def _fault(error: ValidationError, values: Mapping[str, _Setting]) -> str:
     first = error.errors(include_url=False)[0]
+    said = first["msg"].removeprefix("Value error, ")  # pydantic's own word for what our rules say
     key = ".".join(str(part) for part in first["loc"])
     while key and key not in values:  # a whole section's rule, or an element of a list, names no key of its own
         inside = next((k for k in values if k.startswith(f"{key}.")), None)
         if inside:
-            return f"{values[inside].origin}: {key}: {first['msg']}"
+            return f"{values[inside].origin}: {key}: {said}"
         key = key.rpartition(".")[0]
-    origin = values[key].origin if key else "configuration"
-    return f"{origin}: {key} = {values[key].value!r}: {first['msg']}" if key else f"{origin}: {first['msg']}"
+    if key:
+        return f"{values[key].origin}: {key} = {values[key].value!r}: {said}"
+    # a rule over several sections: whoever set what it speaks of
+    origins = dict.fromkeys(setting.origin for k, setting in values.items() if k in said)
+    return f"{', '.join(origins) or 'configuration'}: {said}"
 
 
 def to_toml(tree: Mapping[str, object], origins: Mapping[str, str], prefix: str = "") -> str:

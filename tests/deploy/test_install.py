@@ -169,6 +169,9 @@ def test_the_commented_settings_are_real_ones(tmp_path: Path, role: str) -> None
     assert tomllib.loads(body)["security"]["folder"] == "/etc/treedock/certs"
     with pytest.raises(InputError, match="router2"):
         load(path, environ={}, system_directory=tmp_path / "none")
+    path.write_text(body.replace('folder = "/etc/treedock/certs"', ""))
+    if role == "aircraft":
+        assert load(path, environ={}, system_directory=tmp_path / "none").config.autopilot.vehicle == "real"
 
 
 def test_again_changes_nothing_and_keeps_the_administrators_file(tmp_path: Path) -> None:

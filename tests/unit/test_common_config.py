@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 from pathlib import Path
 
@@ -103,6 +104,27 @@ def test_mistakes_outside_of_files(tmp_path: Path, arguments: dict[str, object],
     with pytest.raises(InputError) as error:
         load(**{"environ": {}, "system_directory": tmp_path, **arguments})  # type: ignore[arg-type]
     assert words in str(error.value)
+
+
+@pytest.mark.parametrize(("text", "words"), [
+    ('[security]\nfolder = "/x"\n', "security.folder is set, but router.protocol is tcp"),
+    ('uav = "station"\n', "uav = 'station': certificates of that name are the ground stations'"),
+    ('[autopilot]\nconnection = "serial:/dev/ttyACM0:57600"\n', "say autopilot.vehicle = 'real'"),
+])  # fmt: skip
+def test_a_rule_of_ours_names_the_file_and_speaks_plainly(tmp_path: Path, text: str, words: str) -> None:
+    own = write(tmp_path, "own.toml", text)
+    with pytest.raises(InputError, match=re.escape(words)) as told:
+        load(own, environ={}, system_directory=tmp_path / "none")
+    assert str(told.value).startswith(f"{own}: ")
+    assert "Value error" not in str(told.value)
+
+
+@pytest.mark.parametrize("vehicle", ["real", "simulation"])
+def test_a_serial_line_is_taken_once_it_is_said_what_it_leads_to(tmp_path: Path, vehicle: str) -> None:
+    text = f'[autopilot]\nconnection = "serial:/dev/ttyACM0:57600"\nvehicle = "{vehicle}"\n'
+    found = load(write(tmp_path, "own.toml", text), environ={}, system_directory=tmp_path / "none").config
+    assert found.autopilot.vehicle == vehicle
+    assert TreedockConfig.model_validate(found.model_dump(mode="json")) == found
 
 
 def test_a_file_that_is_not_text_is_told(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
 class AutopilotConfig(BaseModel):
@@ -15,7 +15,7 @@ class AutopilotConfig(BaseModel):
     connection: str = Field(default="udpin:127.0.0.1:14540", min_length=1)
     """``udpin:HOST:PORT``, ``udpout:HOST:PORT``, ``tcp:HOST:PORT`` or ``serial:DEVICE:BAUD``."""
     vehicle: Literal["simulation", "real"] = "simulation"
-    """Which parameters preflight asks for: on a real aircraft the sticks must win."""
+    """Which parameters preflight asks for: on a real aircraft the sticks must win. To be said where a serial line leads there."""
     check_parameters: bool = True
     """Refuse to engage while a parameter that a flight rests on is not as it has to be."""
     set_parameters: bool = False
@@ -55,3 +55,12 @@ class AutopilotConfig(BaseModel):
     stream_before_offboard_s: float = Field(default=1.5, gt=1.0)
     engage_timeout_s: float = Field(default=12.0, gt=0.0)
     """Patience with each of vision, mode and arming, asked for again and again: PX4's checks pass late after its start."""
+
+    @model_validator(mode="after")
+    def _sticks_win(self) -> AutopilotConfig:
+        """Refuse to guess what a serial line leads to: a real aircraft taken for a simulated one is asked to switch its sticks off."""
+        if self.connection.startswith("serial:") and "vehicle" not in self.model_fields_set:
+            raise ValueError(
+                "autopilot.connection is a serial line: say autopilot.vehicle = 'real', or 'simulation' for hardware in the loop"
+            )
+        return self
