@@ -46,6 +46,7 @@ def gather(config: TreedockConfig) -> Facts:
         units=_units(),
         station=_is_station(config.security.identity),
         certificates=_certificates(folder) if folder else {},
+        certificate_faults=_certificate_faults(folder) if folder else (),
         loose_keys=_loose_keys(folder) if folder else (),
         foreign_keys=_foreign_keys(folder) if folder else (),
         encrypted=folder is not None,
@@ -181,11 +182,16 @@ def _certificates(folder: Path) -> dict[str, float]:
     for path in sorted(folder.glob("*.pem")):
         try:
             end = x509.load_pem_x509_certificate(path.read_bytes()).not_valid_after_utc
-        except (OSError, ValueError):
-            found[path.stem] = -1.0  # unreadable or damaged is as good as expired
+        except (OSError, ValueError):  # told with the faults
             continue
         found[path.stem] = (end - now).total_seconds() / 86400.0
     return found
+
+
+def _certificate_faults(folder: Path) -> list[str]:
+    from services.security.machine import faults_in
+
+    return [] if _hidden(folder) else faults_in(folder)
 
 
 def _loose_keys(folder: Path) -> list[str]:

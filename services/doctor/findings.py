@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from schemas.topics import CAMERA_RGBD
@@ -10,6 +11,8 @@ from services.doctor.aboard import aboard, certificate, disk
 from services.doctor.model import Facts, Finding
 
 CALIBRATION_WARN_DAYS = 180
+AUTHORITY = "ca"
+"""Among the certificates: the one that all others are judged by."""
 SHM_WARN_BYTES = 256_000_000
 USB3_MBIT = 5000.0
 LEAST_LOCKED_BYTES = 1_000_000
@@ -65,7 +68,10 @@ def _security(f: Facts) -> list[Finding]:
                 Finding("encryption", "fail", "the bus is plain and listens to other machines: anybody can fly", do)
             ]
         return [Finding("encryption", "ok", "the bus is plain and stays on this machine")]
-    found = [*(_ for identity, days in sorted(f.certificates.items()) for _ in certificate(identity, days))]
+    do = "treedock certs export on the fleet's machine, then here: sudo treedock certs import FOLDER"
+    found = [Finding("certificate", "fail", fault, do) for fault in f.certificate_faults]
+    for identity, days in sorted(f.certificates.items()):
+        found += _authority(days) if identity == AUTHORITY else certificate(identity, days)
     found += [Finding("keys", "fail", f"{path} can be read by others", f"chmod 600 {path}") for path in f.loose_keys]
     found += [
         Finding(
@@ -76,7 +82,14 @@ def _security(f: Facts) -> list[Finding]:
         )
         for path in f.foreign_keys
     ]
+    if not found and not f.certificates:
+        return [Finding("certificates", "unknown", "they could not be looked at", "sudo treedock doctor")]
     return found or [Finding("certificates", "ok", f"{len(f.certificates)} valid")]
+
+
+def _authority(days: float) -> list[Finding]:
+    do = "treedock certs init --folder ANOTHER, and issue, export and import all certificates anew"
+    return [replace(finding, do=do) for finding in certificate("the authority's own", days)]
 
 
 def _clock(f: Facts) -> list[Finding]:

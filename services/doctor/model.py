@@ -77,6 +77,8 @@ class Facts:
     """This machine is a ground station and no aircraft: it has no camera, passes no frames on and records nothing."""
     certificates: Mapping[str, float] = field(default_factory=dict)
     """Identity to days of validity left."""
+    certificate_faults: Sequence[str] = ()
+    """Why nodes that show these would be refused: missing, damaged, revoked, of another authority."""
     loose_keys: Sequence[str] = ()
     """Private keys that others can read."""
     foreign_keys: Sequence[str] = ()

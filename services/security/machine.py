@@ -39,7 +39,10 @@ def bring(source: Path, to: Path, now: dt.datetime) -> list[Path]:
     for path in sorted(source.glob("*.pem")):
         if path.name == CA_CERTIFICATE:
             continue
-        _check(path, authority, valid, now)
+        certificate = _check(path, authority, valid)
+        if certificate.not_valid_after_utc <= now:
+            end = f"{certificate.not_valid_after_utc:%Y-%m-%d}"
+            raise InputError(f"{path}: expired on {end}; `treedock certs renew` first")
         names += [path.name, path.with_suffix(".key").name]
     _check_later(to, authority, register, names, source)
     make_folder(to, 0o700)
@@ -79,14 +82,28 @@ def _check_later(
             raise InputError(f"{source / Register.FILE}: is old, {entry.common_name} was issued since; {away}")
 
 
-def _check(path: Path, authority: x509.Certificate, valid: dict[str, Identity], now: dt.datetime) -> None:
+def faults_in(folder: Path) -> list[str]:
+    """Return why nodes that show themselves by this folder's files would be refused, but for their age: that is told apart."""
+    try:
+        authority, valid = _certificate(folder / CA_CERTIFICATE), Register.read(folder).valid_names()
+    except InputError as error:
+        return [str(error)]
+    pairs = [path for path in sorted(folder.glob("*.pem")) if path.name != CA_CERTIFICATE]
+    faults = [] if pairs else [f"{folder}: holds no node's certificate"]
+    for path in pairs:
+        try:
+            _check(path, authority, valid)
+        except InputError as error:
+            faults.append(str(error))
+    return faults
+
+
+def _check(path: Path, authority: x509.Certificate, valid: dict[str, Identity]) -> x509.Certificate:
     certificate = _certificate(path)
     try:
         certificate.verify_directly_issued_by(authority)
     except (InvalidSignature, ValueError, TypeError):
         raise InputError(f"{path}: is of another authority than the {CA_CERTIFICATE} beside it") from None
-    if certificate.not_valid_after_utc <= now:
-        raise InputError(f"{path}: expired on {certificate.not_valid_after_utc:%Y-%m-%d}; `treedock certs renew` first")
     name = str(certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)[0].value)
     if name not in valid:
         raise InputError(f"{path}: {name} is revoked or not in {Register.FILE}; export it again")
@@ -101,6 +118,7 @@ def _check(path: Path, authority: x509.Certificate, valid: dict[str, Identity], 
         raise InputError(f"{key}: damaged ({error}); export it again") from error
     if private.public_key() != certificate.public_key():
         raise InputError(f"{key}: does not belong to {path.name}; export both again")
+    return certificate
 
 
 def _certificate(path: Path) -> x509.Certificate:

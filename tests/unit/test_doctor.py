@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import datetime as dt
 import json
+import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -130,6 +132,14 @@ def test_a_sound_machine_has_no_trouble() -> None:
         (replace(SOUND, reachable_from_outside=True), "encryption", "fail", "anybody"),
         (replace(ENCRYPTED, certificates={"uav1.slam": 12.0}), "certificate", "warn", "12 days"),
         (replace(ENCRYPTED, certificates={"uav1.slam": -3.0}), "certificate", "fail", "3 days ago"),
+        (
+            replace(ENCRYPTED, certificates={"ca": 12.0}),
+            "certificate",
+            "warn",
+            "the authority's own expires in 12 days",
+        ),
+        (replace(ENCRYPTED, certificate_faults=("a.pem: damaged",)), "certificate", "fail", "a.pem: damaged"),
+        (replace(ENCRYPTED, certificates={}), "certificates", "unknown", "could not be looked at"),
         (replace(ENCRYPTED, loose_keys=("/etc/x.key",)), "keys", "fail", "/etc/x.key"),
         (replace(ENCRYPTED, foreign_keys=("/etc/x.key",)), "keys", "fail", "services' user"),
     ],
@@ -340,6 +350,53 @@ def test_a_machine_is_really_looked_at(tmp_path: Path) -> None:
     assert facts.recordings_cut == [str(recordings / "a.mcap")]
     assert facts.camera is None
     assert facts.disk_free_bytes is not None
+
+
+def _nothing(folder: Path) -> None:
+    shutil.rmtree(folder)
+
+
+def _of_another_fleet(folder: Path) -> None:
+    now = dt.datetime.now(dt.UTC)
+    other = Authority.create(folder.parent / "other", now).issue(Identity.parse("uav1.slam"), now, days=100)
+    for end in (".pem", ".key"):
+        shutil.copy(other.folder / f"uav1.slam{end}", folder)
+
+
+def _revoked(folder: Path) -> None:
+    Authority.open(folder.parent / "fleet").revoke(Identity.parse("uav1.slam"))
+    shutil.copy(folder.parent / "fleet/identities.json", folder)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (_nothing, r"ca\.pem: No such file"),
+        (_of_another_fleet, r"uav1\.slam\.pem: is of another authority"),
+        (_revoked, r"uav1\.slam\.1 is revoked"),
+        (lambda folder: (folder / "uav1.slam.pem").write_text("x"), r"uav1\.slam\.pem: damaged"),
+        (lambda folder: (folder / "uav1.slam.key").unlink(), r"uav1\.slam\.key: No such file"),
+        (lambda folder: (folder / "uav1.slam.pem").unlink(), "holds no node's certificate"),
+        (lambda folder: (folder / "identities.json").write_text("x"), r"identities\.json: damaged"),
+    ],
+)
+def test_certificates_that_would_be_refused_are_found(
+    tmp_path: Path, spoil: Callable[[Path], object], words: str
+) -> None:
+    now = dt.datetime.now(dt.UTC)
+    slam = Identity.parse("uav1.slam")
+    Authority.create(tmp_path / "fleet", now).issue(slam, now, days=100).export([slam], tmp_path / "certs")
+    config = TreedockConfig.model_validate(
+        {"router": {"protocol": "tls", "port": 1}, "security": {"folder": tmp_path / "certs"}}
+    )
+    about = "certificates"
+    assert next(f for f in judge(gather(config)) if f.about == about).level == "ok"
+    spoil(tmp_path / "certs")
+    found = [f for f in judge(gather(config)) if f.about == "certificate"]
+    assert [f.level for f in found] == ["fail"]
+    assert re.search(words, found[0].text)
+    assert found[0].do
+    assert not any(f.about == about for f in judge(gather(config)))
 
 
 def test_fix_mends_and_the_report_is_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
