@@ -48,6 +48,11 @@ def state_of(service: ServiceFact) -> Finding:
     if service.state == "unreadable":
         words = "is live, but its health cannot be read: another version of treedock?"
         return Finding(name, "fail", words, "install the same version on both machines: sudo deploy/install")
+    if service.twice:
+        words = "runs twice: two processes speak as it, and both would fly"
+        return Finding(
+            name, "fail", words, f"stop the one that should not run: systemctl disable --now treedock-{name}"
+        )
     if service.age_s > SILENT_S:
         words = "is live and says nothing: hung" if service.state == "silent" else f"silent for {service.age_s:.0f} s"
         return Finding(name, "fail", words, _RESTART.format(name, name))

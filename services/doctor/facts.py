@@ -22,14 +22,15 @@ from services.common.memlock import lockable_bytes
 from services.common.version import running_version
 from services.doctor.model import Facts, ServiceFact, VehicleFact
 from services.doctor.told import told
+from services.doctor.twins import Twins
 from services.security.identity import STATION
 
 if TYPE_CHECKING:
     from services.common.config import TreedockConfig
 
 USB_DEVICES = Path("/sys/bus/usb/devices")
-_LISTEN_S = 1.6
-"""Health comes once a second."""
+_LISTEN_S = 2.2
+"""Health comes once a second: of each process twice, so that two of one service are told apart from one started again."""
 
 
 def gather(config: TreedockConfig) -> Facts:
@@ -84,8 +85,12 @@ class _Heard:
     vehicle: VehicleState | None = None
     live: frozenset[str] = frozenset()
     unreadable: int = 0
+    processes: Twins = field(default_factory=Twins)
+    twice: set[str] = field(default_factory=set)
 
     def take_health(self, health: Health) -> None:
+        if self.processes.hear(health, time.monotonic()):
+            self.twice.add(health.service)
         self.health[health.service] = (health, time.monotonic())
 
     def take_vehicle(self, vehicle: VehicleState) -> None:
@@ -117,7 +122,10 @@ def _listen(config: TreedockConfig) -> _Heard:
 
 def _services(heard: _Heard) -> list[ServiceFact]:
     """Return a fact per live service: from its health, else that it is silent, or that its health could not be read."""
-    found = [_service(health, heard_s) for _, (health, heard_s) in sorted(heard.health.items())]
+    found = [
+        replace(_service(health, heard_s), twice=name in heard.twice)
+        for name, (health, heard_s) in sorted(heard.health.items())
+    ]
     state = "unreadable" if heard.unreadable else "silent"
     found += [ServiceFact(name, state, 0, "", 99.0, {}) for name in sorted(heard.live - set(heard.health))]
     return found

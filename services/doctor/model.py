@@ -45,6 +45,8 @@ class ServiceFact:
     disk_free_bytes: int | None = None
     disk_reserve_bytes: int | None = None
     """Of the disk that it records on, and what it leaves free; None: not told, or looked at directly."""
+    twice: bool = False
+    """Two processes speak as it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,14 +22,24 @@ class Asker(Protocol):
         ...
 
 
+_TO_ALL = frozenset({"hold", "abort", "land"})
+"""Orders that make safe: where two navigators run by mistake, both get them."""
+
+
 def send_command(
     asker: Asker, name: CommandName, tree_id: int | None = None, sender: str = "operator", timeout_s: float = 2.0
 ) -> CommandReply | None:
-    """Command the aircraft and return its reply, or None when no navigator answered within ``timeout_s``, twice."""
+    """Command the aircraft and return its reply, or None when no navigator answered within ``timeout_s``, twice.
+
+    Each navigator takes a command with its own nonce alone. Where several answer, nothing but holding and landing is asked
+    of them, and of each: else one would carry out what another one's answer calls refused.
+    """
     nonces = asker.ask(COMMAND_NONCE, NonceRequest(sender=sender), NonceReply, timeout_s)
-    if not nonces:
-        return None
-    fresh = nonces[0]
-    command = Command(name=name, sender=sender, nonce=fresh.nonce, sequence=fresh.next_sequence, tree_id=tree_id)
-    replies = asker.ask(COMMAND, command, CommandReply, timeout_s, leaf=name)
-    return replies[0] if replies else None
+    if len(nonces) > 1 and name not in _TO_ALL:
+        reason = f"{len(nonces)} navigators of this aircraft answer: stop all but one; treedock doctor shows more"
+        return CommandReply(accepted=False, reason=reason, state="unknown")
+    replies: list[CommandReply] = []
+    for fresh in nonces:
+        command = Command(name=name, sender=sender, nonce=fresh.nonce, sequence=fresh.next_sequence, tree_id=tree_id)
+        replies += asker.ask(COMMAND, command, CommandReply, timeout_s, leaf=name)
+    return next((reply for reply in replies if reply.accepted), replies[0] if replies else None)

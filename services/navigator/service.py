@@ -38,6 +38,7 @@ from services.common.context import Context
 from services.common.process import take_small_arrays
 from services.doctor.model import ServiceFact
 from services.doctor.told import told
+from services.doctor.twins import Twins
 from services.fleet.config import ClaimConfig
 from services.fleet.holder import Asked, ClaimView, Holder, Wish
 from services.navigator.commands import CommandDesk
@@ -50,8 +51,8 @@ LOG = logging.getLogger(__name__)
 
 WATCHED = ("camera", "slam", "fusion", "mapper", "detector", "refiner", "autopilot", "station")
 """Services whose health the failsafes look at."""
-_ASKED = (*WATCHED, "router", "recorder", "preview")
-"""Services whose word preflight wants."""
+_ASKED = (*WATCHED, "router", "recorder", "preview", "navigator")
+"""Services whose word preflight wants; the navigator's, for there may be another."""
 _STATE_EVERY = 4
 _TELL_CLAIMS_S = 1.0
 _UNGUARDED = frozenset({"idle", "landed", "failed", "released"})
@@ -118,6 +119,7 @@ class Navigator:
         self._view: Seen[View] | None = None
         self._services: dict[str, int] = {}
         self._aboard: dict[str, ServiceFact] = {}
+        self._twins = Twins()
         self._steps = self._states = 0
         self._claims = ClaimDesk(context, config.claims) if config.claims.enabled else None
 
@@ -206,7 +208,8 @@ class Navigator:
             return
         # stamps of health are the wall's
         offset_s = None if clock.simulated else 1e-9 * (health.stamp_ns - now_ns)
-        self._aboard[health.service] = told(health, clock_offset_s=offset_s)
+        twice = self._twins.hear(health, 1e-9 * self._context.steady_ns())
+        self._aboard[health.service] = told(health, clock_offset_s=offset_s, twice=twice)
 
     def _on_nonce(self, request: NonceRequest) -> NonceReply:
         return self.desk.issue(request.sender, self._context.clock.now_ns())

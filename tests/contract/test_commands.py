@@ -6,9 +6,9 @@ from typing import Any, cast
 
 import pytest
 
-from schemas.command import Command, CommandReply, NonceReply
+from schemas.command import Command, CommandReply, NonceReply, NonceRequest
 from schemas.navigation import Guidance, MissionState
-from schemas.topics import COMMAND, MISSION_GUIDANCE, MISSION_STATE
+from schemas.topics import COMMAND, MISSION_GUIDANCE, MISSION_STATE, Topic
 from services.common.config import TreedockConfig
 from services.common.context import Context
 from services.common.memory import Hub, MemoryContext
@@ -92,9 +92,42 @@ def test_the_navigator_answers_with_its_reason(hub: Hub) -> None:
     assert reply.state == "idle"
 
 
+class TwoNavigators:
+    """Two desks that answer the same keys, as when a navigator runs on two machines."""
+
+    def __init__(self) -> None:
+        self.desks = (_desk(), CommandDesk(10.0, lambda: b"another's nonce!"))
+        self.taken: list[tuple[int, str]] = []
+
+    def ask(self, topic: Topic, request: Any, kind: type[Any], timeout_s: float, leaf: str | None = None) -> list[Any]:
+        del topic, kind, timeout_s, leaf
+        if isinstance(request, NonceRequest):
+            return [desk.issue(request.sender, 0) for desk in self.desks]
+        replies = []
+        for number, desk in enumerate(self.desks):
+            reason = desk.refusal(request, 0)
+            if not reason:
+                self.taken.append((number, request.name))
+            replies.append(CommandReply(accepted=not reason, reason=reason or "done", state="idle"))
+        return replies
+
+
+def test_where_two_navigators_run_nothing_starts_and_both_are_told_to_hold() -> None:
+    """One would carry out what the other one's answer calls refused."""
+    two = TwoNavigators()
+    reply = send_command(two, "start")
+    assert reply is not None
+    assert not reply.accepted
+    assert "2 navigators" in reply.reason
+    assert two.taken == []
+    reply = send_command(two, "hold")
+    assert reply is not None
+    assert reply.accepted
+    assert two.taken == [(0, "hold"), (1, "hold")]
+
+
 def test_the_key_and_the_name_must_agree(hub: Hub) -> None:
     client: MemoryContext = hub.context("station")
-    from schemas.command import NonceRequest
     from schemas.topics import COMMAND_NONCE
 
     nonce = client.ask(COMMAND_NONCE, NonceRequest(sender="ground"), NonceReply, 1.0)[0]

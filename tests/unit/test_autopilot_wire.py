@@ -89,6 +89,8 @@ def test_a_serial_line_carries_bytes_both_ways_and_tells_when_it_is_pulled() -> 
     autopilot, ours = pty.openpty()
     wire = open_wire(f"serial:{os.ttyname(ours)}:921600")
     try:
+        with pytest.raises(InputError, match="exclusive"):
+            open_wire(f"serial:{os.ttyname(ours)}:921600")
         wire.write(b"there")
         assert os.read(autopilot, 16) == b"there"
         os.write(autopilot, b"back")

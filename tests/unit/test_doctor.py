@@ -29,6 +29,7 @@ from services.doctor.facts import gather
 from services.doctor.findings import judge
 from services.doctor.model import Facts, ServiceFact, VehicleFact
 from services.doctor.told import told
+from services.doctor.twins import Twins
 from services.navigator.config import NavigatorConfig
 from services.navigator.preflight import missing
 from services.navigator.service import Navigator
@@ -79,6 +80,7 @@ def test_a_sound_machine_has_no_trouble() -> None:
         (replace(SOUND, units={}), "units", "unknown", "no treedock unit"),
         (replace(SOUND, services=(replace(SLAM, age_s=9.0),)), "slam", "fail", "silent"),
         (replace(SOUND, services=(replace(SLAM, state="degraded", note="lost"),)), "slam", "warn", "lost"),
+        (replace(SOUND, services=(replace(SLAM, twice=True),)), "slam", "fail", "runs twice"),
         (replace(SOUND, services=(replace(SLAM, rates_hz={"slam/pose": 4.0}),)), "slam/pose", "warn", "4.0 Hz, 15"),
         (replace(SOUND, services=(replace(CAMERA, locked_bytes=24_000),)), "shared memory", "warn", "are copied"),
         (replace(SOUND, services=(replace(CAMERA, lockable_bytes=8_000_000),)), "shared memory", "warn", "8000 KB"),
@@ -271,6 +273,40 @@ def test_preflight_hears_what_the_doctor_would_find(service: str, counters: dict
     assert not any(word in fault for fault in told_to_preflight(counters=counters, state="stopping")), (
         "it was ended on purpose"
     )
+
+
+def heard_as_twins(*words: tuple[float, int, float], service: str = "slam") -> list[bool]:
+    """Each word: when it comes, of which process, how old that is."""
+    twins = Twins()
+    return [twins.hear(health(service, pid=pid, uptime_s=uptime_s), now_s) for now_s, pid, uptime_s in words]
+
+
+def test_two_processes_of_one_service_are_told_from_one_started_again() -> None:
+    two = [(0.0, 7, 50.0), (0.4, 9, 3.0), (1.0, 7, 51.0), (1.4, 9, 4.0)]
+    assert heard_as_twins(*two) == [False, False, True, True]
+    assert heard_as_twins(*two, service="station") == [False] * 4, "of those there may be several"
+    assert heard_as_twins(*two, (4.0, 7, 54.0), (5.0, 7, 55.0))[-1:] == [False], "the other was stopped"
+    same_number = [(0.0, 7, 50.0), (0.4, 7, 3.0), (1.0, 7, 51.0), (1.4, 7, 4.0)]
+    assert heard_as_twins(*same_number) == [False, False, True, True]
+    again = [(0.0, 7, 50.0), (1.0, 7, 51.0), (1.6, 9, 0.0), (2.0, 9, 0.4), (3.0, 9, 1.4), (3.1, 9, 1.5)]
+    assert not any(heard_as_twins(*again))
+    late = [(0.0, 7, 50.0), (3.0, 7, 51.0), (3.0, 7, 52.0), (3.1, 7, 53.0), (5.5, 7, 54.0)]
+    assert not any(heard_as_twins(*late)), "a machine without time for its messages"
+
+
+@pytest.mark.parametrize("service", ["slam", "navigator", "autopilot"])
+def test_preflight_refuses_beside_a_second_process_of_a_service(service: str) -> None:
+    hub = Hub(TreedockConfig())
+    navigator = Navigator(cast("Context", hub.context("navigator")), NavigatorConfig(live_guard=False))
+    navigator.register(20.0)
+    state = VehicleState(**{**example(VehicleState).model_dump(), "connected": True, "note": ""})
+    for second, (pid, uptime_s) in enumerate(((7, 50.0), (9, 3.0), (7, 51.0))):
+        hub.clock.set_ns(second * 500_000_000 + 1)
+        hub.context(service).publish(HEALTH, health(service, pid=pid, uptime_s=uptime_s), service)
+        hub.context("autopilot").publish(VEHICLE_STATE, state)
+        hub.run()
+    navigator.step()
+    assert f"{service}: runs twice" in " ".join(missing(navigator.mission.board, navigator.mission.config))
 
 
 def test_preflight_looks_at_the_clocks_where_time_is_the_walls() -> None:

@@ -121,7 +121,8 @@ class SerialWire:
             raise InputError(
                 f"serial:{device}: the package pyserial is missing: run deploy/install (or make setup) again"
             ) from error
-        self._port = serial.Serial(device, baud, timeout=WAIT_S, write_timeout=WAIT_S)
+        # exclusive: a second bridge by mistake would mix its setpoints with ours
+        self._port = serial.Serial(device, baud, timeout=WAIT_S, write_timeout=WAIT_S, exclusive=True)
 
     def read(self) -> bytes:
         """Return what came, empty after a short wait."""
