@@ -91,15 +91,16 @@ def with_port(tree: TreedockConfig, *, fixed: bool) -> TreedockConfig:
     """Return ``tree`` with a free router port: the configured one, else, unless it is ``fixed``, any.
 
     Raises:
-        InputError: the fixed port is taken.
+        InputError: the fixed port is taken, or the address is not this machine's.
     """
-    from services.common.session import free_port, port_is_free
+    from services.common.session import free_port, why_not_listen
 
     host, port = tree.router.host, tree.router.port
-    if port_is_free(host, port):
+    why = why_not_listen(host, port)
+    if not why:
         return tree
-    if fixed:
-        raise InputError(f"port {port} on {host} is in use: stop what listens there, or choose another with --port")
+    if fixed or why_not_listen(host, 0):  # 0: any port
+        raise InputError(why)
     return tree.model_copy(update={"router": tree.router.model_copy(update={"port": free_port(host)})})
 
 

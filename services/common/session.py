@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import socket
@@ -173,15 +174,22 @@ def _reachable(endpoint: str) -> bool:
         return False
 
 
-def port_is_free(host: str, port: int) -> bool:
-    """Whether a router could listen on this TCP address."""
-    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except OSError:
-            return False
-        return True
+def why_not_listen(host: str, port: int) -> str:
+    """Return why a router could not listen on this TCP address, with what to do; empty when it could."""
+    try:
+        family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+        with socket.socket(family) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except socket.gaierror as error:
+        return f"{host} is no known name ({error.strerror}): give router.listen_host an address of this machine"
+    except OSError as error:
+        if error.errno == errno.EADDRINUSE:
+            return f"port {port} on {host} is in use: stop what listens there, or choose another with --port"
+        if error.errno == errno.EADDRNOTAVAIL:
+            return f"{host} is no address of this machine: give router.listen_host one, or 0.0.0.0 for all"
+        return f"cannot listen on port {port} of {host}: {error.strerror}"
+    return ""
 
 
 def free_port(host: str = "127.0.0.1") -> int:

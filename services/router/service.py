@@ -10,7 +10,7 @@ import zenoh
 from services.common.config import TreedockConfig
 from services.common.errors import InputError
 from services.common.runtime import LiveContext, run_service
-from services.common.session import memory_settings, opened, port_is_free, router_config, split_endpoint
+from services.common.session import memory_settings, opened, router_config, split_endpoint, why_not_listen
 from services.common.stop import StopSignal
 from services.router.keeper import TimeKeeper
 from services.router.watch import RegisterWatch
@@ -27,8 +27,8 @@ def listening(config: TreedockConfig) -> Iterator[zenoh.Session]:
     endpoint = config.router.listen_endpoint
     secured = router_settings(config.security, config.uav) | memory_settings(config)
     protocol, host, port = split_endpoint(endpoint)
-    if protocol != "quic" and not port_is_free(host, port):
-        raise InputError(f"port {port} on {host} is in use: stop what listens there, or choose another with --port")
+    if protocol != "quic" and (why := why_not_listen(host, port)):
+        raise InputError(why)
     with ExitStack() as stack:
         try:
             session = stack.enter_context(opened(router_config(endpoint, secured)))

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 
 from schemas.codec import decode, encode
 from schemas.health import Health
+from services.cli.run_plan import with_port
 from services.common import sd_notify
 from services.common.config import TreedockConfig
 from services.common.context import HealthBook
@@ -28,7 +29,7 @@ from services.common.inbox import Inbox
 from services.common.logging import Throttle, set_up
 from services.common.memory import Hub
 from services.common.process import give_back_memory, give_way, prepare_process
-from services.common.session import free_port, port_is_free, split_endpoint
+from services.common.session import free_port, split_endpoint, why_not_listen
 
 ROOT = Path(__file__).parents[2]
 
@@ -150,11 +151,29 @@ def test_endpoints_and_ports() -> None:
     assert split_endpoint("tcp/127.0.0.1:7447") == ("tcp", "127.0.0.1", 7447)
     assert split_endpoint("tls/[::1]:1") == ("tls", "::1", 1)
     port = free_port()
-    assert port_is_free("127.0.0.1", port)
+    assert why_not_listen("127.0.0.1", port) == ""
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", port))
         taken.listen()
-        assert not port_is_free("127.0.0.1", port)
+        assert why_not_listen("127.0.0.1", port).startswith(f"port {port} on 127.0.0.1 is in use: ")
+
+
+@pytest.mark.parametrize(
+    ("host", "words"),
+    [
+        ("192.0.2.1", "is no address of this machine"),
+        ("nobody.invalid", "is no known name"),
+        ("localhost", ""),
+        ("0.0.0.0", ""),
+    ],
+)
+def test_an_address_that_is_not_ours_is_not_called_a_port_in_use(host: str, words: str) -> None:
+    assert words in (why := why_not_listen(host, free_port()))
+    assert bool(why) == bool(words)
+    if words:
+        tree = TreedockConfig.model_validate({"router": {"host": host}})
+        with pytest.raises(InputError, match=words):
+            with_port(tree, fixed=False)
 
 
 def test_the_hub_stops_services_once_and_knows_its_listeners() -> None:
