@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import hashlib
+import os
 import re
 import resource
 import shutil
@@ -244,6 +245,7 @@ def parse(arguments: Sequence[str]) -> tuple[str, Options]:
 def main(arguments: Sequence[str]) -> int:
     """Install or uninstall; 0 done, 2 something is to be mended first."""
     verb, options = parse(arguments)
+    os.umask(0o022)  # a stricter one of root's would hide from the services' user what it is to run
     try:
         check(verb, options)
         for action in installation(options) if verb == "install" else removal(options):

@@ -64,7 +64,7 @@ def load(
     if file is None and environ.get("TREEDOCK_CONFIG"):
         file = Path(environ["TREEDOCK_CONFIG"])
     settings: list[_Setting] = []
-    for path in sorted(system_directory.glob("*.toml")) if system_directory.is_dir() else []:
+    for path in _system_files(system_directory):
         settings += _from_file(path)
     if file is not None:
         settings += _from_file(file)
@@ -74,10 +74,21 @@ def load(
     return _assemble(settings)
 
 
+def _system_files(folder: Path) -> list[Path]:
+    try:
+        return sorted(path for path in folder.iterdir() if path.suffix == ".toml")
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    except OSError as error:  # glob would find nothing and say nothing: the defaults would be in force
+        raise InputError(f"{folder}: this user may not look into it: sudo chmod a+rx {folder}") from error
+
+
 def _from_file(path: Path) -> list[_Setting]:
     try:
         text = path.read_text()
         body = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+    except PermissionError as error:
+        raise InputError(f"{path}: this user may not read it: sudo chmod a+r {path}") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give --config an existing file") from error
     except ValueError as error:  # both parsers' errors are of this kind, as is text that is not UTF-8

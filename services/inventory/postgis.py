@@ -1,4 +1,4 @@
-"""The inventory in PostgreSQL with PostGIS: the same tables, by URL. The driver is an extra: ``pip install treedock[postgis]``."""
+"""The inventory in PostgreSQL with PostGIS: the same tables, by URL. The driver is an extra: ``psycopg[binary]``."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class PostGis:
             from psycopg.rows import dict_row
         except ImportError:
             raise InputError(
-                "inventory: a postgresql:// database needs the driver psycopg: pip install 'treedock[postgis]'"
+                "inventory: a postgresql:// database needs the driver psycopg: pip install 'psycopg[binary]'"
             ) from None
         self.path = url.rpartition("@")[2]  # the part without a password, for messages
         self.failure: type[Exception] = psycopg.Error

@@ -45,6 +45,8 @@ def pair_of(security: SecurityConfig, uav: str, service: str | None) -> Pair | N
         try:
             with path.open("rb"):
                 pass
+        except PermissionError as error:
+            raise InputError(f"{path}: this user may not read it; sudo, or the services' own user, may") from error
         except OSError as error:
             raise InputError(
                 f"{path}: {error.strerror}; `treedock certs issue {identity.text}` and `certs export` put it there"

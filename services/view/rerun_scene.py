@@ -32,7 +32,7 @@ def load_rerun() -> ModuleType:
     try:
         import rerun
     except ImportError:
-        raise InputError("the rerun viewer is not installed: pip install 'treedock[view]'") from None
+        raise InputError("the rerun viewer is not installed: pip install rerun-sdk") from None
     module: ModuleType = rerun
     return module
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import shutil
 import subprocess
 import sys
@@ -290,6 +291,17 @@ def test_exposure_stays_low_with_the_capability(tmp_path: Path) -> None:
         path.write_text(text)
         command = ["systemd-analyze", "security", "--offline=yes", "--threshold=20", "--no-pager", str(path)]
         assert subprocess.run(command, capture_output=True, check=False).returncode == 0, unit.name
+
+
+def test_what_is_laid_down_can_be_read_whatever_roots_umask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(actions.Run, "do", lambda _: None)
+    before = os.umask(0o077)
+    try:
+        assert installer.main(["--root", str(tmp_path)]) == 0
+    finally:
+        os.umask(before)
+    closed = {path for path in tmp_path.rglob("*") if not path.is_symlink() and path.stat().st_mode & 0o044 != 0o044}
+    assert closed == {tmp_path / "etc/treedock/certs"}
 
 
 def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.skipif(not URL, reason="no PostGIS named by INVENTORY_P
 
 @pytest.fixture(autouse=True)
 def emptied() -> None:
-    psycopg = pytest.importorskip("psycopg", reason="psycopg is not installed: pip install 'treedock[postgis]'")
+    psycopg = pytest.importorskip("psycopg", reason="psycopg is not installed: pip install 'psycopg[binary]'")
     with psycopg.connect(URL, autocommit=True) as db:
         for table in ("trees", "trees_local", "sites", "flights", "sightings", "measurements", "events"):
             db.execute(f"DROP TABLE IF EXISTS {table}")

@@ -119,6 +119,24 @@ def test_a_rule_of_ours_names_the_file_and_speaks_plainly(tmp_path: Path, text: 
     assert "Value error" not in str(told.value)
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become a user without rights")
+@pytest.mark.parametrize("closed", ["", "10.toml"])
+def test_settings_that_a_user_may_not_read_are_told_not_left_out(tmp_path: Path, closed: str) -> None:
+    """With the defaults in their place an aircraft would fly another camera, on a plain bus."""
+    folder = tmp_path / "etc"
+    folder.mkdir()
+    write(folder, "10.toml", 'uav = "kea"\n')
+    for place in (tmp_path, *tmp_path.parents[:-2]):
+        place.chmod(place.stat().st_mode | 0o055)
+    (folder / closed).chmod(0o600)
+    os.seteuid(65534)
+    try:
+        with pytest.raises(InputError, match=f"{folder / closed}: this user may not .*: sudo chmod a"):
+            load(environ={}, system_directory=folder)
+    finally:
+        os.seteuid(0)
+
+
 @pytest.mark.parametrize("vehicle", ["real", "simulation"])
 def test_a_serial_line_is_taken_once_it_is_said_what_it_leads_to(tmp_path: Path, vehicle: str) -> None:
     text = f'[autopilot]\nconnection = "serial:/dev/ttyACM0:57600"\nvehicle = "{vehicle}"\n'

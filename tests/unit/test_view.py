@@ -71,4 +71,4 @@ def test_without_rerun_one_line_says_how_to_get_it(
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert invoke(["view", "x.mcap"]) == 2
-    assert "pip install 'treedock[view]'" in capsys.readouterr().err
+    assert "pip install rerun-sdk" in capsys.readouterr().err

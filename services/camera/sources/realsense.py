@@ -37,7 +37,7 @@ def require_library() -> None:
         InputError: it is not.
     """
     if find_spec("pyrealsense2") is None:
-        raise InputError("camera source realsense: pyrealsense2 is missing; install treedock[realsense]")
+        raise InputError("camera source realsense: pyrealsense2 is missing; pip install pyrealsense2")
 
 
 class RealsenseSource:
