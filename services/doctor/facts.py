@@ -63,6 +63,8 @@ def gather(config: TreedockConfig) -> Facts:
         camera_mbit=mbit,
         source=config.camera.source,
         camera_file=config.camera.camera_file,
+        camera_fault=_camera_fault(config.camera.camera_file),
+        real=config.autopilot.vehicle == "real",
         calibration_days=_age_days(config.camera.camera_file),
     )
 
@@ -278,3 +280,14 @@ def _camera(source: str) -> tuple[str | None, float | None]:
 def _age_days(camera_file: str) -> float | None:
     day = calibrated_on(Path(camera_file)) if camera_file else None
     return None if day is None else float((dt.datetime.now(dt.UTC).date() - day).days)
+
+
+def _camera_fault(camera_file: str) -> str:
+    from services.camera.sources.camera_json import read_intrinsics
+
+    try:
+        if camera_file:
+            read_intrinsics(Path(camera_file))
+    except InputError as error:
+        return str(error)
+    return ""

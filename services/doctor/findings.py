@@ -143,22 +143,36 @@ def _disk(f: Facts) -> list[Finding]:
 
 
 def _camera(f: Facts) -> list[Finding]:
+    if f.source == "sim" and f.real:
+        do = 'camera.source = "realsense" in /etc/treedock; or autopilot.vehicle = "simulation"'
+        return [Finding("camera", "fail", "simulated, for a real aircraft (autopilot.vehicle = real)", do)]
     if f.source == "sim":
         return [Finding("camera", "ok", "simulated (camera.source = sim)")]
+    return [_sensor(f), *_calibration(f)]
+
+
+def _sensor(f: Facts) -> Finding:
     if f.camera is None:
         do = "lsusb; another cable and port; udevadm control --reload; is the user in groups video and plugdev?"
-        return [Finding("camera", "fail", f"{f.source}: not found", do)]
+        return Finding("camera", "fail", f"{f.source}: not found", do)
     if f.camera_mbit is not None and f.camera_mbit < USB3_MBIT:
         words = f"{f.camera} on a slow USB link ({f.camera_mbit:.0f} Mbit/s): frames will be missing"
-        return [Finding("camera", "warn", words, "a USB 3 port and cable"), *_calibration(f)]
-    return [Finding("camera", "ok", f.camera), *_calibration(f)]
+        return Finding("camera", "warn", words, "a USB 3 port and cable")
+    return Finding("camera", "ok", f.camera)
 
 
 def _calibration(f: Facts) -> list[Finding]:
     do = "treedock calibrate IMAGES... makes a new one (docs/calibration.md)"
     if not f.camera_file:
         return [Finding("calibration", "ok", "the source's own (camera.camera_file is not set)")]
+    if f.camera_fault:
+        return [Finding("calibration", "fail", f.camera_fault, do)]
     if f.calibration_days is None:
         return [Finding("calibration", "warn", f"{f.camera_file} does not say when it was made", do)]
+    if f.calibration_days < -1:  # a day is the maker's, who may live east of here
+        words = f"{f.camera_file} was made {-f.calibration_days:.0f} days in the future"
+        return [
+            Finding("calibration", "warn", words, "is this machine's date right (date)? if so, its maker's was not")
+        ]
     words = f"{f.camera_file}, {f.calibration_days:.0f} days old"
     return [Finding("calibration", "warn" if f.calibration_days > CALIBRATION_WARN_DAYS else "ok", words, do)]

@@ -104,5 +104,9 @@ class Facts:
     source: str = "sim"
     camera_file: str = ""
     """The calibration in use; empty: the sensor's own, from the factory."""
+    camera_fault: str = ""
+    """Why that file cannot be used."""
     calibration_days: float | None = None
     """Its age; None: it does not say."""
+    real: bool = False
+    """The configuration says that a real aircraft is flown."""

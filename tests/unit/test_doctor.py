@@ -115,6 +115,10 @@ def test_a_sound_machine_has_no_trouble() -> None:
         (replace(SOUND, camera=None), "camera", "fail", "not found"),
         (replace(SOUND, camera_mbit=480.0), "camera", "warn", "480 Mbit/s"),
         (replace(SOUND, camera_file="c.json", calibration_days=400.0), "calibration", "warn", "400 days"),
+        (replace(SOUND, camera=None, camera_file="c.json", calibration_days=400.0), "calibration", "warn", "400 days"),
+        (replace(SOUND, camera_file="c.json", calibration_days=-9.0), "calibration", "warn", "9 days in the future"),
+        (replace(SOUND, camera_file="c.json", camera_fault="c.json: fx missing"), "calibration", "fail", "fx missing"),
+        (replace(SOUND, source="sim", real=True), "camera", "fail", "simulated, for a real aircraft"),
         (replace(SOUND, camera_file="c.json", calibration_days=None), "calibration", "warn", "does not say"),
         (replace(SOUND, services=(replace(SLAM, state="unreadable", age_s=99.0),)), "slam", "fail", "another version"),
         (replace(SOUND, services=(replace(SLAM, state="silent", age_s=99.0),)), "slam", "fail", "hung"),
@@ -340,6 +344,9 @@ def test_the_age_of_a_calibration_is_what_it_says_not_the_files(tmp_path: Path) 
     assert gather(config).calibration_days == 200.0
     file.write_text("{}")
     assert gather(config).calibration_days is None
+    assert "camera.json: width" in gather(config).camera_fault
+    file.unlink()
+    assert str(file) in gather(config).camera_fault
 
 
 def test_a_user_without_rights_is_told_so(tmp_path: Path) -> None:
