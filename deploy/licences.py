@@ -19,6 +19,8 @@ TEST_ONLY = frozenset({"evo"})
 """Used by tests and benches alone, never shipped nor imported by a service."""
 TOLD_ELSEWHERE = {"open3d-cpu": "MIT"}
 """Packages whose metadata is silent, with what their own LICENSE file says."""
+ELSEWHERE = frozenset({"open3d", "pyrealsense2"})
+"""Pins of another platform or of an extra: told when they are not installed here."""
 
 
 def licence_of(package: Any) -> str:  # noqa: ANN401 - the protocol lacks get, which every version has
@@ -51,16 +53,21 @@ def fault_of(name: str, licence: str) -> str:
 
 def main() -> int:
     """Print the list; 1 when something is wrong with it."""
-    faults = []
+    faults: list[str] = []
+    absent: list[str] = []
     for name in sorted(pinned(), key=str.lower):
         try:
             licence = TOLD_ELSEWHERE.get(name) or licence_of(metadata(name))
         except PackageNotFoundError:
-            continue  # a pin of another platform
+            absent.append(name)
+            continue
         fault = fault_of(name, licence)
         sys.stdout.write(f"{name:32} {licence}{'   <-- ' + fault if fault else ''}\n")
         if fault:
             faults.append(f"{name}: {fault}")
+    if absent:
+        sys.stdout.write(f"not looked at, for they are not installed here: {', '.join(absent)}\n")
+    faults += [f"{name}: not installed, so not looked at: make setup" for name in absent if name not in ELSEWHERE]
     for fault in faults:
         sys.stderr.write(f"licences: {fault}\n")
     return bool(faults)

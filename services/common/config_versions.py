@@ -117,6 +117,8 @@ def migrate_file(path: Path) -> str:
     """
     from services.common.config_loader import to_toml
 
+    if path.suffix == ".json":
+        raise InputError(f"{path}: --migrate writes TOML; an old JSON file is read as it is: leave --migrate out")
     try:
         text = path.read_text(encoding="utf-8")
         body = tomllib.loads(text)

@@ -25,6 +25,20 @@ def test_every_pin_has_a_licence_that_may_be_shipped() -> None:
     assert len(done.stdout.splitlines()) > 80
 
 
+def test_a_pin_that_is_not_installed_is_no_sound_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pins = tmp_path / "constraints.txt"
+    monkeypatch.setattr(licences, "CONSTRAINTS", pins)
+    pins.write_text("pytest==1\nopen3d==1\n")
+    assert licences.main() == 0
+    pins.write_text("pytest==1\nopen3d==1\nno-such-package==1\n")
+    assert licences.main() == 1
+    out, err = capsys.readouterr()
+    assert "not looked at, for they are not installed here: no-such-package" in out
+    assert err == "licences: no-such-package: not installed, so not looked at: make setup\n"
+
+
 @pytest.mark.parametrize(
     ("name", "licence", "bad"),
     [("x", "", True), ("x", "GPL-3.0-only", True), ("x", "AGPLv3", True), ("x", "LGPL-3.0-or-later", False),

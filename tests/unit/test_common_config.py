@@ -269,6 +269,13 @@ def test_a_file_from_the_future_is_not_migrated(tmp_path: Path) -> None:
         migrate_file(path)
 
 
+def test_a_json_file_is_not_overwritten_with_toml(tmp_path: Path) -> None:
+    path = write(tmp_path, "a.json", "[1]\n")  # is TOML, too
+    with pytest.raises(InputError, match=r"a\.json: --migrate writes TOML"):
+        migrate_file(path)
+    assert path.read_text() == "[1]\n"
+
+
 def test_the_dump_carries_the_version_and_is_read_again(capsys: pytest.CaptureFixture[str]) -> None:
     assert invoke(["config"]) == 0
     assert current(tomllib.loads(capsys.readouterr().out), "dump")["uav"] == "uav1"
