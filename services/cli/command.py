@@ -52,8 +52,16 @@ def _ask(name: CommandName, tree_id: int | None, timeout_s: float, tree: object)
     from services.common.session import opened_node
     from services.common.stop import StopSignal
     from services.navigator.client import send_command
+    from services.security.identity import STATION
+    from services.security.transport import shown_by
 
     assert isinstance(tree, TreedockConfig)
+    if tree.security.folder is not None and (shown := shown_by(tree.security, tree.uav, None)).role != STATION:
+        # the router would drop the question without a word
+        raise InputError(
+            f"command {name}: {shown.text} may only look; a station's certificate commands: security.identity = "
+            '"station.NAME", issued and imported here (docs/operations.md)'
+        )
     stop = StopSignal()
     stop.install()
     with opened_node(tree, None, lambda: stop.is_set, wait_s=0.0) as session:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import logging
+import re
 import socket
 import threading
 import time
@@ -26,6 +27,8 @@ LOG = logging.getLogger(__name__)
 
 _CLOSE_TIMEOUT_S = 0.5
 _RETRY_S = 0.1
+_SOURCE_LINE = re.compile(r" at \S+\.rs:\d+")
+"""Zenoh's errors name the line of its own code."""
 _PRIORITIES = (
     "control", "real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background",
 )  # fmt: skip
@@ -145,7 +148,13 @@ def opened_client(
         try:
             session = stack.enter_context(opened(client_config(endpoint, secured)))
         except zenoh.ZError as error:
-            raise InputError(f"the router at {endpoint} refused the session: {error}") from error
+            hint = (
+                "does it want certificates (router.protocol, security.folder)?"
+                if endpoint.startswith("tcp/")
+                else "is this certificate of its authority and not expired, and the address one of its --host?"
+            )
+            said = _SOURCE_LINE.sub("", str(error)).rstrip(".")
+            raise InputError(f"the router at {endpoint} refused the session: {said}; {hint}") from error
         yield session
 
 

@@ -52,7 +52,8 @@ def _bus(f: Facts) -> list[Finding]:
         return [Finding("router", "fail", f.router_fault or f"nobody answers at {f.wanted_router}", do)]
     found = [Finding("router", "ok", f.router), *aboard(f.services, f.vehicle, f.version)]
     if not f.services:
-        found.append(Finding("services", "warn", "no service is up", _start(f)))
+        words = "no service is up" + (", or this certificate is revoked or of another aircraft" if f.encrypted else "")
+        found.append(Finding("services", "warn", words, _start(f)))
     return found
 
 

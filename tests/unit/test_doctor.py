@@ -75,6 +75,7 @@ def test_a_sound_machine_has_no_trouble() -> None:
     [
         (replace(SOUND, router=None, services=()), "router", "fail", "7447"),
         (replace(SOUND, services=()), "services", "warn", "no service"),
+        (replace(ENCRYPTED, services=()), "services", "warn", "or this certificate is revoked"),
         (replace(SOUND, units={"treedock-slam.service": "failed"}), "units", "fail", "treedock-slam"),
         (replace(SOUND, units={"treedock-slam.service": "inactive"}), "units", "warn", "stopped"),
         (replace(SOUND, units={}), "units", "unknown", "no treedock unit"),

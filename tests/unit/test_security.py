@@ -216,3 +216,13 @@ def test_what_was_revoked_is_not_exported(fleet: Path, tmp_path: Path) -> None:
     assert invoke(["certs", "revoke", "station.all", "--folder", str(fleet)]) == 0
     assert invoke(["certs", "export", "station.alice", "--folder", str(fleet), "--to", str(tmp_path / "to")]) == 2
     assert not (tmp_path / "to").exists()
+
+
+def test_who_may_only_look_is_told_so_instead_of_waiting_for_an_answer(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = ["--set", f"security.folder={tmp_path}", "--set", "router.protocol=tls", "--port", "1"]
+    assert invoke(["command", "land", *settings]) == 2
+    assert "uav1.reader may only look" in capsys.readouterr().err
+    assert invoke(["command", "land", *settings, "--set", "security.identity=station.alice"]) == 2
+    assert "station.alice" in capsys.readouterr().err
