@@ -127,10 +127,13 @@ def _environment(options: Options) -> Iterator[Action]:
     prefix = options.at(options.prefix)
     python = str(prefix / "bin/python")
     yield Folder(prefix / MARK)  # first of all: also what is left of an attempt that broke off is known as ours
-    yield Run((sys.executable, "-m", "venv", str(prefix)), "a private environment", needed=not Path(python).exists())
+    new = not Path(
+        python
+    ).exists()  # also when the system's Python became another: what was installed for the old is lost
+    yield Run((sys.executable, "-m", "venv", str(prefix)), "a private environment", needed=new)
     offline = ("--no-index", "--find-links", str(options.wheels)) if options.wheels else ()
     stamp, wanted = prefix / STAMP, source_hash()
-    changed = not stamp.is_file() or stamp.read_text() != wanted
+    changed = new or not stamp.is_file() or stamp.read_text() != wanted
     if changed:
         yield Remove(stamp)  # an attempt that is broken off is no installation
         # numba asks whether a kernel's own file changed, not those of the kernels compiled into it

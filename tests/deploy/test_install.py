@@ -33,10 +33,15 @@ def options(tmp_path: Path, *arguments: str) -> installer.Options:
 
 
 def staged(tmp_path: Path, *arguments: str) -> None:
-    """Everything but the environment, which takes minutes and a package index."""
-    for action in installer.installation(options(tmp_path, *arguments)):
+    """Everything but the environment, which takes minutes and a package index: an empty file stands for it."""
+    given = options(tmp_path, *arguments)
+    for action in installer.installation(given):
         if not isinstance(action, actions.Run):
             action.do()
+        elif action.needed and "venv" in action.command:
+            python = given.at(given.prefix) / "bin/python"
+            python.parent.mkdir(parents=True, exist_ok=True)
+            python.touch()
 
 
 def test_the_unit_files_are_the_tables() -> None:
@@ -203,6 +208,13 @@ def test_packages_are_installed_again_only_when_something_changed(
     staged(tmp_path)
     assert kernels.exists()
     assert not any("pip install" in command for command in runs(tmp_path))
+    python = tmp_path / "opt/treedock/bin/python"
+    python.unlink()
+    python.symlink_to("python3.old")  # the system's Python was upgraded
+    assert [command.split()[2] for command in runs(tmp_path)[:2]] == ["venv", "pip"]
+    staged(tmp_path)
+    kernels.parent.mkdir(parents=True)
+    kernels.write_bytes(b"compiled")
     monkeypatch.setattr(installer, "source_hash", lambda: "another")
     assert any("pip install" in command for command in runs(tmp_path))
     staged(tmp_path)
@@ -314,7 +326,6 @@ def test_a_dry_run_writes_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 def test_uninstall_leaves_configuration_and_data_unless_purged(tmp_path: Path) -> None:
     staged(tmp_path)
-    (tmp_path / "opt/treedock/bin").mkdir(parents=True)
     assert installer.main(["uninstall", "--root", str(tmp_path)]) == 0
     assert not (tmp_path / "opt/treedock").exists()
     assert list((tmp_path / "etc/systemd/system").iterdir()) == []
