@@ -10,6 +10,8 @@ import typer
 from services.cli.options import AsJson, ConfigFile, Port, Settings, loaded
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
     from services.doctor.model import Facts, Finding
 
 _MARKS = {"ok": ("ok  ", typer.colors.GREEN), "warn": ("warn", typer.colors.YELLOW),
@@ -56,26 +58,44 @@ def _print(findings: list[Finding]) -> None:
 
 
 def _mended(facts: Facts) -> bool:
-    """Mend keys' rights, cut recordings and failed units; return whether anything was done."""
+    """Mend keys' rights, cut recordings and failed units; say of each whether it is; return whether anything was done."""
+    from services.common.errors import InputError
+
+    done = False
+    for words, mend in _mending(facts):
+        try:
+            said = mend()
+        except (OSError, InputError) as error:
+            typer.echo(f"not fixed: {words}: {error}", err=True)
+            continue
+        typer.echo(f"fixed: {said or words}", err=True)
+        done = True
+    return done
+
+
+def _mending(facts: Facts) -> Iterator[tuple[str, Callable[[], object]]]:
+    """Yield what can be mended: in words, and what does it (and may return better words)."""
     import shutil
-    import subprocess
+    from functools import partial
     from pathlib import Path
 
     from services.recorder.recover import recover
 
-    done = []
     for path in facts.loose_keys:
-        Path(path).chmod(0o600)
-        done.append(f"chmod 600 {path}")
+        yield f"chmod 600 {path}", partial(Path(path).chmod, 0o600)
     for path in facts.foreign_keys:
         owner = Path(path).parent.stat()
-        shutil.chown(path, owner.st_uid, owner.st_gid)
-        done.append(f"chown {owner.st_uid}:{owner.st_gid} {path}")
-    done += [str(recover(Path(path))) for path in facts.recordings_cut]
+        yield f"chown {owner.st_uid}:{owner.st_gid} {path}", partial(shutil.chown, path, owner.st_uid, owner.st_gid)
+    for path in facts.recordings_cut:
+        yield path, partial(recover, Path(path))
     for name, state in sorted(facts.units.items()):
         if state == "failed":
-            subprocess.run(["systemctl", "restart", name], check=False)
-            done.append(f"systemctl restart {name}")
-    for line in done:
-        typer.echo(f"fixed: {line}", err=True)
-    return bool(done)
+            yield f"systemctl restart {name}", partial(_restart, name)
+
+
+def _restart(unit: str) -> None:
+    import subprocess
+
+    done = subprocess.run(["systemctl", "restart", unit], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise OSError(done.stderr.strip() or f"exit code {done.returncode}")

@@ -259,7 +259,10 @@ def _hidden(path: Path) -> bool:
 def _cut(folder: Path) -> list[str]:
     from services.recorder.recover import cut_recordings
 
-    return [] if _hidden(folder) or not folder.is_dir() else [str(path) for path in cut_recordings(folder)]
+    try:
+        return [] if _hidden(folder) or not folder.is_dir() else [str(path) for path in cut_recordings(folder)]
+    except PermissionError:  # a recording that this user may not read
+        return []
 
 
 def _camera(source: str) -> tuple[str | None, float | None]:

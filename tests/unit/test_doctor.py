@@ -19,6 +19,7 @@ from schemas.health import Health
 from schemas.topics import HEALTH, VEHICLE_STATE
 from schemas.vehicle import VehicleState
 from services.cli.app import invoke
+from services.cli.doctor import _mended
 from services.common.clock import WallClock
 from services.common.config import TreedockConfig
 from services.common.context import Context, HealthBook
@@ -441,6 +442,25 @@ def test_certificates_that_would_be_refused_are_found(
     assert re.search(words, found[0].text)
     assert found[0].do
     assert not any(f.about == about for f in judge(gather(config)))
+
+
+def test_what_could_not_be_mended_is_not_called_fixed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    def run(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        return subprocess.CompletedProcess(command, 1, "", "Unit treedock-slam.service not found.\n")
+
+    monkeypatch.setattr("subprocess.run", run)
+    broken = tmp_path / "a.mcap"
+    broken.write_bytes(b"not one at all")
+    facts = replace(
+        SOUND, loose_keys=("/nowhere/x.key",), recordings_cut=(str(broken),), units={"treedock-slam.service": "failed"}
+    )
+    assert not _mended(facts)
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.partition(": ")[0] for line in lines] == ["not fixed"] * 3
+    assert "No such file" in lines[0]
+    assert lines[2] == "not fixed: systemctl restart treedock-slam.service: Unit treedock-slam.service not found."
 
 
 def test_fix_mends_and_the_report_is_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
