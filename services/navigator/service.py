@@ -212,7 +212,7 @@ class Navigator:
         self._aboard[health.service] = told(health, clock_offset_s=offset_s, twice=twice)
 
     def _on_nonce(self, request: NonceRequest) -> NonceReply:
-        return self.desk.issue(request.sender, self._context.clock.now_ns())
+        return self.desk.issue(request.sender, self._context.steady_ns())
 
     def _on_command_named(self, name: CommandName) -> Callable[[Command], CommandReply]:
         def handle(command: Command) -> CommandReply:
@@ -222,7 +222,8 @@ class Navigator:
 
     def _on_command(self, name: CommandName, command: Command) -> CommandReply:
         now_ns = self._context.clock.now_ns()
-        reason = self.desk.refusal(command, now_ns)
+        # not by the clock: it is the wall's, and set back by an hour it would let a command of an hour ago be fresh
+        reason = self.desk.refusal(command, self._context.steady_ns())
         if not reason and command.name != name:
             reason = f"sent to cmd/{name} but named {command.name}"
         if reason:

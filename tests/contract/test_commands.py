@@ -8,7 +8,7 @@ import pytest
 
 from schemas.command import Command, CommandReply, NonceReply, NonceRequest
 from schemas.navigation import Guidance, MissionState
-from schemas.topics import COMMAND, MISSION_GUIDANCE, MISSION_STATE, Topic
+from schemas.topics import COMMAND, COMMAND_NONCE, MISSION_GUIDANCE, MISSION_STATE, Topic
 from services.common.config import TreedockConfig
 from services.common.context import Context
 from services.common.memory import Hub, MemoryContext
@@ -92,6 +92,21 @@ def test_the_navigator_answers_with_its_reason(hub: Hub) -> None:
     assert reply.state == "idle"
 
 
+def test_a_clock_that_is_set_back_makes_no_old_command_fresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    hub = Hub(TreedockConfig())
+    hub.clock.set_ns(7_200 * SECOND)
+    navigator = hub.context("navigator")
+    steady_s = [100.0]
+    monkeypatch.setattr(navigator, "steady_ns", lambda: round(steady_s[0] * SECOND))
+    build(cast("Context", navigator))
+    client = hub.context("station")
+    old = client.ask(COMMAND_NONCE, NonceRequest(sender="ground"), NonceReply, 1.0)[0]
+    hub.clock.set_ns(3_600 * SECOND)
+    steady_s[0] += 11.0
+    reply = client.ask(COMMAND, _command(old, name="land"), CommandReply, 1.0, leaf="land")[0]
+    assert reply.reason.startswith("stale")
+
+
 class TwoNavigators:
     """Two desks that answer the same keys, as when a navigator runs on two machines."""
 
@@ -128,8 +143,6 @@ def test_where_two_navigators_run_nothing_starts_and_both_are_told_to_hold() -> 
 
 def test_the_key_and_the_name_must_agree(hub: Hub) -> None:
     client: MemoryContext = hub.context("station")
-    from schemas.topics import COMMAND_NONCE
-
     nonce = client.ask(COMMAND_NONCE, NonceRequest(sender="ground"), NonceReply, 1.0)[0]
     replies = client.ask(COMMAND, _command(nonce, name="land"), CommandReply, 1.0, leaf="hold")
     assert not replies[0].accepted
