@@ -8,22 +8,27 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from services.cli.options import AsJson
+from services.cli.options import AsJson, ConfigFile, Settings, loaded
 
 if TYPE_CHECKING:
     from services.recorder.index import Run
 
 
 def recordings(
-    folder: Annotated[Path, typer.Argument(help="Folder of recordings.")] = Path("recordings"),
+    folder: Annotated[
+        Path | None, typer.Argument(help="Folder of recordings (default: the configured recorder.folder).")
+    ] = None,
     *,
     recover: Annotated[bool, typer.Option("--recover", help="Mend files that were cut short.")] = False,
     as_json: AsJson = False,
+    config: ConfigFile = None,
+    settings: Settings = None,
 ) -> None:
     """List recordings: when, how long, how big, frames and trees' versions in them."""
     from services.recorder.index import index
     from services.recorder.recover import recover_folder
 
+    folder = folder or loaded(config, settings, None).config.recorder.folder
     found = index(folder)
     if recover:
         for mended in recover_folder(folder):

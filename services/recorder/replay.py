@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +14,7 @@ from schemas.camera import RgbdFrame
 from schemas.codec import Wire
 from schemas.topics import CAMERA_COMPRESSED, CAMERA_RGBD, TOPICS, VEHICLE_STATE, Topic
 from services.common.errors import InputError
+from services.doctor.twins import SINGLE
 from services.recorder.reader import Recorded, messages
 
 if TYPE_CHECKING:
@@ -56,7 +58,7 @@ def play(config: TreedockConfig, file: Path, span: Span, *, everything: bool = F
     """Play a file onto the configured bus until its end or a stop signal.
 
     Raises:
-        InputError: the file cannot be used, or no router answers.
+        InputError: the file cannot be used, no router answers, or those run whose words it would say.
     """
     from services.common.bus import Bus
     from services.common.context import HealthBook
@@ -71,10 +73,33 @@ def play(config: TreedockConfig, file: Path, span: Span, *, everything: bool = F
         raise InputError(f"{file}: it holds nothing to replay; `treedock recordings` shows what is in a file")
     with opened_node(config, "camera", lambda: stop.is_set, wait_s=0.0) as session:
         bus = Bus(session, config.uav, HealthBook())
-        return _play(bus, itertools.chain([first], entries), first.stamp_ns, span, stop)
+        others = SINGLE if everything else frozenset(topic.producer for topic in SENSORS)
+        alone(bus, others)
+        return _play(bus, itertools.chain([first], entries), first.stamp_ns, span, stop, others)
 
 
-def _play(bus: Bus, entries: itertools.chain[Recorded | str], first_ns: int, span: Span, stop: StopSignal) -> Played:
+def alone(bus: Bus, others: Iterable[str]) -> None:
+    """Refuse to speak beside those whose words a recording holds: a recorded flight's guidance would fly the aircraft.
+
+    Raises:
+        InputError: some of them run.
+    """
+    live = sorted(name for name in others if bus.alive(name))
+    if live:
+        raise InputError(
+            f"replay: {', '.join(live)} of {bus.uav} would be mixed up with the recording: stop what runs first, for "
+            "example sudo systemctl stop treedock.target"
+        )
+
+
+def _play(
+    bus: Bus,
+    entries: itertools.chain[Recorded | str],
+    first_ns: int,
+    span: Span,
+    stop: StopSignal,
+    others: Iterable[str],
+) -> Played:
     played, begin_s = Played(), time.monotonic()
     # the moment of now at which the recording's start would lie: added to every stamp of the recording
     moved_ns = time.time_ns() - first_ns - round(span.begin_s * 1e9)
@@ -90,6 +115,7 @@ def _play(bus: Bus, entries: itertools.chain[Recorded | str], first_ns: int, spa
         due_s = begin_s + (at_s - span.begin_s) / span.rate
         if (wait_s := due_s - time.monotonic()) > 0 and stop.wait(wait_s):
             break
+        alone(bus, others)  # one of them may have been started since
         topic, message = _to_send(entry, moved_ns, at_s - span.begin_s, span.rate)
         bus.publish(topic, message, entry.leaf)
         played.sent += 1

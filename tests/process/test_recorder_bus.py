@@ -8,12 +8,14 @@ import time
 from pathlib import Path
 
 from schemas.camera import RgbdFrame
-from schemas.topics import CAMERA_COMPRESSED, CAMERA_RGBD, TREES_LIST
+from schemas.topics import CAMERA_COMPRESSED, CAMERA_RGBD, TREES_LIST, VEHICLE_STATE
+from schemas.vehicle import VehicleState
 from services.camera.codecs import recode
 from services.common.bus import Bus
 from services.recorder.reader import Recorded, messages
 from tests.process.conftest import ROOT, System
 from tests.process.nodes import frame, tree_list
+from tests.unit.recorder_files import recorded
 
 
 def treedock(system: System, *arguments: str) -> subprocess.Popen[bytes]:
@@ -72,3 +74,21 @@ def test_a_run_is_recorded_and_fed_back(system: System, tmp_path: Path) -> None:
     assert heard[0].colour_encoding == "bgr8"
     assert all(abs(time.time_ns() - f.stamp_ns) < 60e9 for f in heard), "stamps are of now"
     assert f"{len(recorded)} messages" in system.said("replay")
+
+
+def test_a_recorded_flight_is_not_said_again_beside_what_flies(system: System, tmp_path: Path) -> None:
+    """Its guidance comes with fresh stamps: a bridge that stands disarmed would engage."""
+    path = recorded(tmp_path)
+    system.start("router")
+    with system.bus() as bus:
+        heard: list[VehicleState] = []
+        bus.subscribe(VEHICLE_STATE, heard.append)
+        bus.declare_live("autopilot")
+        for arguments in ([], ["--everything"]):
+            player = treedock(system, "replay", str(path), *arguments)
+            assert player.wait(timeout=20.0) == 2
+        assert bus.inbox.take() is None
+    assert system.said("replay").count("replay: autopilot of ") == 2
+    with system.bus() as bus:
+        bus.declare_live("station")
+        assert treedock(system, "replay", str(path), "--everything").wait(timeout=20.0) == 0

@@ -127,6 +127,9 @@ def test_recordings_are_listed_and_cut_ones_told(tmp_path: Path, capsys: pytest.
     assert invoke(["recordings", str(tmp_path), "--recover"]) == 0
     assert "cut short or" not in capsys.readouterr().out
     assert invoke(["recordings", str(tmp_path / "nowhere")]) == 2
+    capsys.readouterr()
+    assert invoke(["recordings", "--set", f"recorder.folder={tmp_path}"]) == 0
+    assert "12 frames" in capsys.readouterr().out
 
 
 def test_replay_refuses_what_it_cannot_play(tmp_path: Path) -> None:
