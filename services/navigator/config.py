@@ -16,16 +16,16 @@ class MotionConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     max_speed_m_s: float = Field(default=0.5, gt=0.0, le=2.0)
-    max_accel_m_s2: float = Field(default=0.5, gt=0.0)
-    max_jerk_m_s3: float = Field(default=2.0, gt=0.0)
-    max_yaw_rate_rad_s: float = Field(default=math.radians(30.0), gt=0.0)
-    max_yaw_accel_rad_s2: float = Field(default=math.radians(40.0), gt=0.0)
-    leash_m: float = Field(default=0.6, gt=0.0)
+    max_accel_m_s2: float = Field(default=0.5, gt=0.0, le=5.0)
+    max_jerk_m_s3: float = Field(default=2.0, gt=0.0, le=50.0)
+    max_yaw_rate_rad_s: float = Field(default=math.radians(30.0), gt=0.0, le=math.pi)
+    max_yaw_accel_rad_s2: float = Field(default=math.radians(40.0), gt=0.0, le=math.tau)
+    leash_m: float = Field(default=0.6, gt=0.0, le=2.0)
     """The setpoint stops running ahead when the aircraft is this far behind it."""
-    fence_radius_m: float = Field(default=12.0, gt=0.0)
+    fence_radius_m: float = Field(default=12.0, gt=0.0, le=200.0)
     """Geofence: horizontal distance from the start."""
-    fence_height_m: float = Field(default=3.0, gt=0.0)
-    fence_margin_m: float = Field(default=0.7, gt=0.0)
+    fence_height_m: float = Field(default=3.0, gt=0.0, le=50.0)
+    fence_margin_m: float = Field(default=0.7, gt=0.0, le=5.0)
     """The failsafe acts when the aircraft itself is this far outside."""
 
 
@@ -34,7 +34,7 @@ class DockConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    aim_m: float = Field(default=0.95, gt=0.0)
+    aim_m: float = Field(default=0.95, gt=0.0, le=5.0)
     min_m: float = Field(default=0.85, gt=0.0)
     max_m: float = Field(default=1.00, gt=0.0)
     margin_m: float = Field(default=0.02, ge=0.0)
@@ -72,40 +72,43 @@ class DockConfig(BaseModel):
 
 
 class FailsafeConfig(BaseModel):
-    """Time limits: ``*_s`` until the failsafe acts, ``*_hold_s`` in hold before landing."""
+    """Time limits: ``*_s`` until the failsafe acts, ``*_hold_s`` in hold before landing.
+
+    Bounded above: milliseconds, or infinity, would switch a failsafe off without a word.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    pose_silent_s: float = Field(default=0.4, gt=0.0)
-    pose_land_s: float = Field(default=0.9, gt=0.0)
+    pose_silent_s: float = Field(default=0.4, gt=0.0, le=5.0)
+    pose_land_s: float = Field(default=0.9, gt=0.0, le=5.0)
     """Without a pose for this long we land. PX4 gives up its position 1 s after the last vision (EKF2_NOAID_TOUT) and
     0.2 s of its own delay; until then it still lands on our word, and lands better: on its position as long as it can."""
-    pose_carried_s: float = Field(default=0.3, ge=0.0)
+    pose_carried_s: float = Field(default=0.3, ge=0.0, le=2.0)
     """So much longer when slam fell silent without a word: as long as the bridge carries its last pose on
     (autopilot.propagate_s)."""
-    pose_hold_s: float = Field(default=3.0, gt=0.0)
+    pose_hold_s: float = Field(default=3.0, gt=0.0, le=60.0)
     """After a jump: in hold until the poses agree with each other again, or landing."""
-    pose_jump_m: float = Field(default=0.4, gt=0.0)
-    pose_jump_rad: float = Field(default=math.radians(15.0), gt=0.0)
-    correction_hold_m: float = Field(default=1.0, gt=0.0)
+    pose_jump_m: float = Field(default=0.4, gt=0.0, le=5.0)
+    pose_jump_rad: float = Field(default=math.radians(15.0), gt=0.0, le=math.pi)
+    correction_hold_m: float = Field(default=1.0, gt=0.0, le=10.0)
     """A told correction larger than this is held upon like a jump."""
-    target_lost_s: float = Field(default=0.45, gt=0.0)
-    target_hold_s: float = Field(default=10.0, gt=0.0)
-    trees_stale_s: float = Field(default=120.0, gt=0.0)
-    trees_hold_s: float = Field(default=15.0, gt=0.0)
-    service_silent_s: float = Field(default=3.5, gt=0.0)
-    service_hold_s: float = Field(default=20.0, gt=0.0)
-    vehicle_silent_s: float = Field(default=0.5, gt=0.0)
-    vehicle_hold_s: float = Field(default=5.0, gt=0.0)
-    ground_silent_s: float = Field(default=5.0, gt=0.0)
-    ground_hold_s: float = Field(default=30.0, gt=0.0)
+    target_lost_s: float = Field(default=0.45, gt=0.0, le=5.0)
+    target_hold_s: float = Field(default=10.0, gt=0.0, le=300.0)
+    trees_stale_s: float = Field(default=120.0, gt=0.0, le=3600.0)
+    trees_hold_s: float = Field(default=15.0, gt=0.0, le=300.0)
+    service_silent_s: float = Field(default=3.5, gt=0.0, le=30.0)
+    service_hold_s: float = Field(default=20.0, gt=0.0, le=300.0)
+    vehicle_silent_s: float = Field(default=0.5, gt=0.0, le=5.0)
+    vehicle_hold_s: float = Field(default=5.0, gt=0.0, le=60.0)
+    ground_silent_s: float = Field(default=5.0, gt=0.0, le=60.0)
+    ground_hold_s: float = Field(default=30.0, gt=0.0, le=600.0)
     battery_start_share: float = Field(default=0.40, ge=0.0, le=1.0)
     battery_land_share: float = Field(default=0.20, ge=0.0, le=1.0)
     battery_next_share: float = Field(default=0.30, ge=0.0, le=1.0)
     """Below this no further tree is begun: return and land."""
-    obstacle_hold_s: float = Field(default=10.0, gt=0.0)
-    restart_hold_s: float = Field(default=5.0, gt=0.0)
-    operator_hold_s: float = Field(default=180.0, gt=0.0)
+    obstacle_hold_s: float = Field(default=10.0, gt=0.0, le=300.0)
+    restart_hold_s: float = Field(default=5.0, gt=0.0, le=60.0)
+    operator_hold_s: float = Field(default=180.0, gt=0.0, le=3600.0)
     clear_s: float = Field(default=1.0, ge=0.0)
     """A fault must be gone for this long before the mission goes on."""
 
@@ -128,17 +131,17 @@ class NavigatorConfig(BaseModel):
     rate_hz: float = Field(default=20.0, ge=5.0, le=100.0)
     start_height_m: float = Field(default=0.1, ge=0.0)
     """Camera above ground at the start (the map's origin)."""
-    flight_height_m: float = Field(default=1.5, gt=0.0)
+    flight_height_m: float = Field(default=1.5, gt=0.0, le=50.0)
     min_ground_m: float = Field(default=1.0, gt=0.0)
     """Least height over the ground at the target's foot: the aircraft rises on a slope."""
-    climb_speed_m_s: float = Field(default=0.4, gt=0.0)
-    scan_rate_rad_s: float = Field(default=math.radians(25.0), gt=0.0)
+    climb_speed_m_s: float = Field(default=0.4, gt=0.0, le=2.0)
+    scan_rate_rad_s: float = Field(default=math.radians(25.0), gt=0.0, le=math.pi)
     scan_overlap_rad: float = Field(default=math.radians(20.0), ge=0.0)
     scan_falter_inliers: int = Field(default=40, ge=0)
     """With fewer matched points than this slam falters: the scan turns back and comes again slowly."""
     scan_turns_max: float = Field(default=2.2, ge=1.0)
-    turn_rate_rad_s: float = Field(default=math.radians(25.0), gt=0.0)
-    approach_speed_m_s: float = Field(default=0.35, gt=0.0)
+    turn_rate_rad_s: float = Field(default=math.radians(25.0), gt=0.0, le=math.pi)
+    approach_speed_m_s: float = Field(default=0.35, gt=0.0, le=2.0)
     approach_gain_per_s: float = Field(default=0.5, gt=0.0)
     """Speed per metre still to go: the closer, the slower."""
     visual_range_m: float = Field(default=4.0, gt=0.0)
@@ -166,6 +169,6 @@ class NavigatorConfig(BaseModel):
     arm_wait_s: float = Field(default=40.0, gt=0.0)
     """More than the bridge spends on mode and arming (autopilot.engage_timeout_s each): it knows the reason."""
     takeoff_wait_s: float = Field(default=30.0, gt=0.0)
-    nonce_valid_s: float = Field(default=10.0, gt=0.0)
+    nonce_valid_s: float = Field(default=10.0, gt=0.0, le=60.0)
     ground_required: bool = False
     """Refuse to start without a ground station; a lost one is acted upon either way once it was there."""

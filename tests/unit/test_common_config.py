@@ -119,6 +119,23 @@ def test_a_rule_of_ours_names_the_file_and_speaks_plainly(tmp_path: Path, text: 
     assert "Value error" not in str(told.value)
 
 
+@pytest.mark.parametrize(("key", "value"), [
+    ("navigator.failsafe.pose_silent_s", "400"),  # milliseconds
+    ("navigator.failsafe.pose_silent_s", "inf"),
+    ("navigator.motion.max_yaw_rate_rad_s", "30"),  # degrees
+    ("navigator.motion.fence_radius_m", "1200"),  # centimetres
+    ("navigator.scan_rate_rad_s", "25"),
+    ("navigator.approach_speed_m_s", "35"),
+    ("autopilot.guidance_stale_s", "400"),
+    ("autopilot.setpoint_reach_m", "inf"),
+    ("autopilot.camera_pitch_rad", "-20"),
+    ("autopilot.camera_offset_m", "[100, 0, 30]"),
+])  # fmt: skip
+def test_a_limit_in_the_wrong_unit_is_refused_not_a_failsafe_less(tmp_path: Path, key: str, value: str) -> None:
+    with pytest.raises(InputError, match=rf"--set {key}: {key}"):
+        load(flags=[f"{key}={value}"], environ={}, system_directory=tmp_path)
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become a user without rights")
 @pytest.mark.parametrize("closed", ["", "10.toml"])
 def test_settings_that_a_user_may_not_read_are_told_not_left_out(tmp_path: Path, closed: str) -> None:
