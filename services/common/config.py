@@ -74,6 +74,11 @@ class TreedockConfig(BaseModel):
             raise ValueError(f"router.protocol {self.router.protocol} needs security.folder (see `treedock certs`)")
         if self.security.folder is not None and not encrypted:
             raise ValueError("security.folder is set, but router.protocol is tcp: set it to tls, or to quic")
+        if self.autopilot.vehicle == "real" and not encrypted and not self.router.local:
+            raise ValueError(
+                "autopilot.vehicle is real, and anybody who reaches router.host or router.listen_host could fly it: certificates "
+                "and router.protocol = 'tls' (docs/operations.md), or '127.0.0.1' for both"
+            )
         return self
 
 

@@ -51,7 +51,7 @@ def gather(config: TreedockConfig) -> Facts:
         loose_keys=_loose_keys(folder) if folder else (),
         foreign_keys=_foreign_keys(folder) if folder else (),
         encrypted=folder is not None,
-        reachable_from_outside=_from_outside(config.router.listen_host or config.router.host),
+        reachable_from_outside=not config.router.local,
         clock_synchronised=_synchronised(),
         lockable_bytes=lockable_bytes(),
         shm_free_bytes=_free(Path("/dev/shm")),
@@ -71,10 +71,6 @@ def gather(config: TreedockConfig) -> Facts:
 
 def _vehicle(state: VehicleState) -> VehicleFact:
     return VehicleFact(state.connected, state.note, state.battery_share)
-
-
-def _from_outside(host: str) -> bool:
-    return host not in {"127.0.0.1", "::1", "[::1]", "localhost"}
 
 
 @dataclass

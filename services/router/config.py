@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ipaddress
+
 from pydantic import BaseModel, ConfigDict, Field
 
 
@@ -32,6 +34,20 @@ class RouterConfig(BaseModel):
         """Return the address that the router listens on."""
         return self._at(self.listen_host or self.host)
 
+    @property
+    def local(self) -> bool:
+        """Whether the bus stays on this machine: nodes connect, and the router listens, to itself alone."""
+        return all(_is_local(host) for host in (self.host, self.listen_host or self.host))
+
     def _at(self, host: str) -> str:
         written = f"[{host}]" if ":" in host and not host.startswith("[") else host
         return f"{self.protocol}/{written}:{self.port}"
+
+
+def _is_local(host: str) -> bool:
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
@@ -15,6 +16,8 @@ from services.common.stop import StopSignal
 from services.router.keeper import TimeKeeper
 from services.router.watch import RegisterWatch
 from services.security.transport import router_settings
+
+LOG = logging.getLogger(__name__)
 
 
 @contextmanager
@@ -49,6 +52,8 @@ def run(config: TreedockConfig, stop: StopSignal | None = None) -> int:
     if stop is None:
         stop = StopSignal()
         stop.install()
+    if config.security.folder is None and not config.router.local:
+        LOG.warning("the bus is plain and open to other machines: whoever reaches it can command (docs/operations.md)")
     watch = RegisterWatch(config.security, stop.set)
 
     def build(context: LiveContext) -> None:

@@ -108,6 +108,7 @@ def test_mistakes_outside_of_files(tmp_path: Path, arguments: dict[str, object],
 
 @pytest.mark.parametrize(("text", "words"), [
     ('[security]\nfolder = "/x"\n', "security.folder is set, but router.protocol is tcp"),
+    ('[router]\nlisten_host = "0.0.0.0"\n[autopilot]\nvehicle = "real"\n', "anybody who reaches router.host or router.listen_host"),
     ('uav = "station"\n', "uav = 'station': certificates of that name are the ground stations'"),
     ('[autopilot]\nconnection = "serial:/dev/ttyACM0:57600"\n', "say autopilot.vehicle = 'real'"),
 ])  # fmt: skip
@@ -160,6 +161,19 @@ def test_a_serial_line_is_taken_once_it_is_said_what_it_leads_to(tmp_path: Path,
     found = load(write(tmp_path, "own.toml", text), environ={}, system_directory=tmp_path / "none").config
     assert found.autopilot.vehicle == vehicle
     assert TreedockConfig.model_validate(found.model_dump(mode="json")) == found
+
+
+@pytest.mark.parametrize(
+    ("host", "listen_host", "local"),
+    [("127.0.0.1", "", True), ("localhost", "[::1]", True), ("127.0.0.1", "0.0.0.0", False), ("10.0.0.7", "", False)],
+)
+def test_a_plain_bus_for_a_real_aircraft_stays_on_its_machine(host: str, listen_host: str, *, local: bool) -> None:
+    values = {"router": {"host": host, "listen_host": listen_host}, "autopilot": {"vehicle": "real"}}
+    if local:
+        assert TreedockConfig.model_validate(values).router.local
+    else:
+        with pytest.raises(ValueError, match="could fly it"):
+            TreedockConfig.model_validate(values)
 
 
 def test_a_file_that_is_not_text_is_told(tmp_path: Path) -> None:
