@@ -136,9 +136,12 @@ def import_(
 
 
 def _opened(folder: Path) -> Authority:
-    from services.security.authority import Authority
+    from services.security.authority import CA_KEY, Authority
 
-    return Authority.open(folder)
+    authority = Authority.open(folder)
+    if (folder / CA_KEY).stat().st_mode & 0o077:  # told, not refused: a stick's file system may know no rights
+        typer.echo(f"warning: {folder / CA_KEY}, the fleet's secret, can be read by others: chmod 600 it", err=True)
+    return authority
 
 
 def _issue(authority: Authority, identity: Identity, days: int, hosts: Sequence[str] | None) -> Authority:

@@ -212,6 +212,15 @@ def test_what_cannot_be_done_whole_is_refused_and_nothing_is_done(
     assert not (tmp_path / "to").exists()
 
 
+@pytest.mark.parametrize(("mode", "told"), [(0o600, False), (0o644, True), (0o640, True)])
+def test_a_fleets_secret_that_others_can_read_is_told(
+    fleet: Path, capsys: pytest.CaptureFixture[str], *, mode: int, told: bool
+) -> None:
+    (fleet / "ca.key").chmod(mode)
+    assert invoke(["certs", "issue", "uav1.slam", "--folder", str(fleet)]) == 0
+    assert ("can be read by others" in capsys.readouterr().err) == told
+
+
 def test_what_was_revoked_is_not_exported(fleet: Path, tmp_path: Path) -> None:
     assert invoke(["certs", "revoke", "station.all", "--folder", str(fleet)]) == 0
     assert invoke(["certs", "export", "station.alice", "--folder", str(fleet), "--to", str(tmp_path / "to")]) == 2
