@@ -10,6 +10,7 @@ SINGLE = frozenset({
     "camera", "second_camera", "slam", "second_slam", "fusion", "mapper", "detector", "refiner", "navigator", "autopilot",
 })  # fmt: skip
 """Services that an aircraft flies by; of stations, recorders and previews there may be several."""
+_MOST = 4
 _FORGET_S = 2.5
 """A process not heard for so long is gone: health comes once a second."""
 
@@ -47,5 +48,6 @@ class Twins:
             own = _Process(health.pid, health.uptime_s, now_s, now_s)
             known.append(own)
         own.uptime_s, own.last_s = health.uptime_s, now_s
+        known = known[-_MOST:]
         self._processes[health.service] = known
         return any(a.first_s < b.last_s and b.first_s < a.last_s for a in known for b in known if a is not b)
