@@ -162,11 +162,8 @@ def _locked_bytes(process: Path) -> int | None:
 
 
 def _units() -> dict[str, str]:
-    if shutil.which("systemctl") is None:
-        return {}
-    command = ["systemctl", "list-units", "--all", "--plain", "--no-legend", "treedock*.service"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=False)
-    rows = [line.split() for line in done.stdout.splitlines()]
+    said = _said("systemctl", "list-units", "--all", "--plain", "--no-legend", "treedock*.service")
+    rows = [line.split() for line in said.splitlines()]
     return {row[0]: row[2] for row in rows if len(row) > 2 and row[1] == "loaded"}
 
 
@@ -174,11 +171,16 @@ def _is_station(identity: str) -> bool:
     """Return whether this machine is a ground station alone, by its certificate's name or the target that it starts."""
     if identity:
         return identity.startswith(f"{STATION}.")
-    if shutil.which("systemctl") is None:
-        return False
-    command = ["systemctl", "is-enabled", "treedock.target", "treedock-station.target"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=False)
-    return done.stdout.split()[-1:] == ["enabled"] and not done.stdout.startswith("enabled")
+    said = _said("systemctl", "is-enabled", "treedock.target", "treedock-station.target")
+    return said.split()[-1:] == ["enabled"] and not said.startswith("enabled")
+
+
+def _said(*command: str) -> str:
+    """Return what a tool of the system prints; nothing where it is not there, or hangs."""
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=False).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
 
 
 def _certificates(folder: Path) -> dict[str, float]:
@@ -211,11 +213,8 @@ def _foreign_keys(folder: Path) -> list[str]:
 
 
 def _synchronised() -> bool | None:
-    if shutil.which("timedatectl") is None:
-        return None
-    command = ["timedatectl", "show", "-p", "NTPSynchronized", "--value"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=False)
-    return {"yes": True, "no": False}.get(done.stdout.strip())
+    said = _said("timedatectl", "show", "-p", "NTPSynchronized", "--value")
+    return {"yes": True, "no": False}.get(said.strip())
 
 
 def _free(path: Path) -> int | None:

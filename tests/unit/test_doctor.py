@@ -444,6 +444,16 @@ def test_certificates_that_would_be_refused_are_found(
     assert not any(f.about == about for f in judge(gather(config)))
 
 
+@pytest.mark.parametrize("fault", [FileNotFoundError("systemctl"), subprocess.TimeoutExpired("systemctl", 10.0)])
+def test_a_system_that_does_not_answer_is_no_bug(monkeypatch: pytest.MonkeyPatch, fault: Exception) -> None:
+    def run(*_: object, **__: object) -> None:
+        raise fault
+
+    monkeypatch.setattr("subprocess.run", run)
+    facts = gather(TreedockConfig.model_validate({"router": {"port": 1}}))
+    assert (facts.units, facts.clock_synchronised, facts.station) == ({}, None, False)
+
+
 def test_what_could_not_be_mended_is_not_called_fixed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
