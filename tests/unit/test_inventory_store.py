@@ -200,7 +200,7 @@ def test_files_that_are_no_inventory_are_refused_in_one_line(tmp_path: Path) -> 
 
 def test_postgis_without_its_driver_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "psycopg", None)
-    with pytest.raises(InputError, match=r"pip install 'treedock\[postgis\]'"):
+    with pytest.raises(InputError, match=r"pip install 'psycopg\[binary\]'"):
         open_store("postgresql://user:secret@host/db")
 
 
