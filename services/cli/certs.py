@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -47,9 +51,8 @@ def init(*, folder: Folder = _FOLDER) -> None:
 @certs_app.command("issue")
 def issue(names: Names, *, folder: Folder = _FOLDER, days: Days = _DAYS, host: Hosts = None) -> None:
     """Issue certificates; one that an identity holds already is revoked."""
-    authority = _opened(folder)
-    for identity in _expanded(names):
-        authority = _issue(authority, identity, days, host)
+    with _opened(folder) as authority:
+        _issue_all(authority, [(identity, host) for identity in _expanded(names)], days)
     typer.echo(_next_step(folder))
 
 
@@ -58,27 +61,24 @@ def renew(names: Names, *, folder: Folder = _FOLDER, days: Days = _DAYS, host: H
     """Issue anew what was issued before, with the same addresses unless --host names others."""
     from services.common.errors import InputError
 
-    authority = _opened(folder)
-    identities = _expanded(names, authority)
-    hosts = {entry.identity: entry.hosts for entry in authority.register.entries}  # of the latest
-    new = [identity.text for identity in identities if identity.text not in hosts]
-    if new:
-        raise InputError(f"{new[0]}: nothing was issued yet; `treedock certs issue {new[0]}` does it")
-    for identity in identities:
-        authority = _issue(authority, identity, days, host or hosts[identity.text])
+    with _opened(folder) as authority:
+        identities = _expanded(names, authority)
+        hosts = {entry.identity: entry.hosts for entry in authority.register.entries}  # of the latest
+        new = [identity.text for identity in identities if identity.text not in hosts]
+        if new:
+            raise InputError(f"{new[0]}: nothing was issued yet; `treedock certs issue {new[0]}` does it")
+        _issue_all(authority, [(identity, host or hosts[identity.text]) for identity in identities], days)
     typer.echo(_next_step(folder))
 
 
 @certs_app.command("revoke")
 def revoke(names: Names, *, folder: Folder = _FOLDER) -> None:
     """Take all rights from identities; routers refuse them once they have the new list."""
-    authority = _opened(folder)
-    identities = _expanded(names, authority)
-    for identity in identities:  # all or nothing: a mistyped name is noticed before the first is revoked
-        authority.holding(identity)
-    for identity in identities:
-        authority = authority.revoke(identity)
-        typer.echo(f"{identity.text}: revoked")
+    with _opened(folder) as authority:
+        identities = _expanded(names, authority)
+        for identity in identities:  # all or nothing: a mistyped name is noticed before the first is revoked
+            authority.holding(identity)
+        _revoke_all(authority, identities)
     typer.echo(
         f"bring the new {folder / 'identities.json'} to every router's machine (certs export and import, or copy it to "
         "/etc/treedock/certs): the router there takes it within seconds"
@@ -114,8 +114,8 @@ def export(
     folder: Folder = _FOLDER,
 ) -> None:
     """Copy what a machine with these nodes needs; never the authority's key."""
-    authority = _opened(folder)
-    files = authority.export(_expanded(names, authority), to)
+    with _opened(folder) as authority:
+        files = authority.export(_expanded(names, authority), to)
     typer.echo(f"{len(files)} files in {to}; on the machine they are for: sudo treedock certs import THAT_FOLDER")
 
 
@@ -135,19 +135,33 @@ def import_(
     )
 
 
-def _opened(folder: Path) -> Authority:
+@contextmanager
+def _opened(folder: Path) -> Iterator[Authority]:
+    """Open the authority for one command at a time: two that write its list would lose each other's entries."""
     from services.security.authority import CA_KEY, Authority
 
-    authority = Authority.open(folder)
-    if (folder / CA_KEY).stat().st_mode & 0o077:  # told, not refused: a stick's file system may know no rights
-        typer.echo(f"warning: {folder / CA_KEY}, the fleet's secret, can be read by others: chmod 600 it", err=True)
-    return authority
+    Authority.open(folder)  # what is wrong with the folder is told before it is locked
+    holder = os.open(folder, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(holder, fcntl.LOCK_EX)  # the other command is short: this one waits
+        if (folder / CA_KEY).stat().st_mode & 0o077:  # told, not refused: a stick's file system may know no rights
+            typer.echo(f"warning: {folder / CA_KEY}, the fleet's secret, can be read by others: chmod 600 it", err=True)
+        yield Authority.open(folder)
+    finally:
+        os.close(holder)
 
 
-def _issue(authority: Authority, identity: Identity, days: int, hosts: Sequence[str] | None) -> Authority:
-    authority = authority.issue(identity, _now(), days, tuple(hosts or ("127.0.0.1", "localhost")))
-    typer.echo(f"{identity.text}: valid until {authority.register.entries[-1].valid_until[:10]}")
-    return authority
+def _issue_all(authority: Authority, asked: Sequence[tuple[Identity, Sequence[str] | None]], days: int) -> None:
+    for identity, hosts in asked:
+        authority = authority.issue(identity, _now(), days, tuple(hosts or ("127.0.0.1", "localhost")))
+        typer.echo(f"{identity.text}: valid until {authority.register.entries[-1].valid_until[:10]}")
+
+
+def _revoke_all(authority: Authority, identities: Sequence[Identity]) -> None:
+    for identity in identities:
+        authority = authority.revoke(identity)
+        typer.echo(f"{identity.text}: revoked")
 
 
 def _expanded(names: Sequence[str], authority: Authority | None = None) -> list[Identity]:

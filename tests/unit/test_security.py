@@ -5,6 +5,8 @@ from __future__ import annotations
 import datetime as dt
 import json
 import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -23,6 +25,7 @@ from services.security.identity import ROLES, Identity
 from services.security.register import Register
 from services.security.transport import node_settings, pair_of, router_settings
 
+ROOT = Path(__file__).parents[2]
 NOW = dt.datetime(2026, 11, 1, tzinfo=dt.UTC)
 
 
@@ -235,3 +238,11 @@ def test_who_may_only_look_is_told_so_instead_of_waiting_for_an_answer(
     assert "uav1.reader may only look" in capsys.readouterr().err
     assert invoke(["command", "land", *settings, "--set", "security.identity=station.alice"]) == 2
     assert "station.alice" in capsys.readouterr().err
+
+
+def test_two_who_issue_at_once_lose_no_entry(fleet: Path) -> None:
+    names = [f"uav{number}.slam" for number in range(10, 18)]
+    command = [sys.executable, "-m", "services.cli.app", "certs", "issue", "--folder", str(fleet)]
+    running = [subprocess.Popen([*command, name], cwd=ROOT, stdout=subprocess.DEVNULL) for name in names]
+    assert [process.wait() for process in running] == [0] * len(names)
+    assert set(names) <= {entry.identity for entry in Register.read(fleet).entries}
