@@ -6,7 +6,7 @@ import fcntl
 import json
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -140,16 +140,15 @@ def _opened(folder: Path) -> Iterator[Authority]:
     """Open the authority for one command at a time: two that write its list would lose each other's entries."""
     from services.security.authority import CA_KEY, Authority
 
-    Authority.open(folder)  # what is wrong with the folder is told before it is locked
-    holder = os.open(folder, os.O_RDONLY)
-    try:
-        with suppress(OSError):  # a file system without locks
+    with ExitStack() as held:
+        with suppress(OSError):  # no such folder, which is told below, or a file system without locks
+            holder = os.open(folder, os.O_RDONLY)
+            held.callback(os.close, holder)
             fcntl.flock(holder, fcntl.LOCK_EX)  # the other command is short: this one waits
+        authority = Authority.open(folder)
         if (folder / CA_KEY).stat().st_mode & 0o077:  # told, not refused: a stick's file system may know no rights
             typer.echo(f"warning: {folder / CA_KEY}, the fleet's secret, can be read by others: chmod 600 it", err=True)
-        yield Authority.open(folder)
-    finally:
-        os.close(holder)
+        yield authority
 
 
 def _issue_all(authority: Authority, asked: Sequence[tuple[Identity, Sequence[str] | None]], days: int) -> None:

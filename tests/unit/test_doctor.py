@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import datetime as dt
-import json
-import re
 import shutil
-import subprocess
-import sys
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -18,8 +13,6 @@ import pytest
 from schemas.health import Health
 from schemas.topics import HEALTH, VEHICLE_STATE
 from schemas.vehicle import VehicleState
-from services.cli.app import invoke
-from services.cli.doctor import _mended
 from services.common.clock import WallClock
 from services.common.config import TreedockConfig
 from services.common.context import Context, HealthBook
@@ -34,7 +27,6 @@ from services.doctor.twins import Twins
 from services.navigator.config import NavigatorConfig
 from services.navigator.preflight import missing
 from services.navigator.service import Navigator
-from services.recorder.config import RecorderConfig
 from services.recorder.space import tell_space
 from services.security.authority import Authority
 from services.security.config import SecurityConfig
@@ -326,159 +318,3 @@ def test_preflight_looks_at_the_clocks_where_time_is_the_walls() -> None:
         assert [f"{1e3 * off_s:+.0f} ms" in fault for fault in found if fault.startswith("clock")] == [True] * bool(
             off_s
         )
-
-
-def test_a_camera_is_known_by_its_product_name_and_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    device = tmp_path / "2-1"
-    device.mkdir()
-    (device / "product").write_text("Intel(R) RealSense(TM) Depth Camera 435i\n")
-    (device / "speed").write_text("480\n")
-    monkeypatch.setattr("services.doctor.facts.USB_DEVICES", tmp_path)
-    facts = gather(TreedockConfig.model_validate({"camera": {"source": "realsense"}, "router": {"port": 1}}))
-    assert (facts.camera, facts.camera_mbit) == ("Intel(R) RealSense(TM) Depth Camera 435i", 480.0)
-
-
-def test_the_age_of_a_calibration_is_what_it_says_not_the_files(tmp_path: Path) -> None:
-    file = tmp_path / "camera.json"
-    day = dt.datetime.now(dt.UTC).date() - dt.timedelta(days=200)
-    file.write_text(json.dumps({"calibration": {"day": day.isoformat()}}))
-    config = TreedockConfig.model_validate({"camera": {"camera_file": str(file)}, "router": {"port": 1}})
-    assert gather(config).calibration_days == 200.0
-    file.write_text("{}")
-    assert gather(config).calibration_days is None
-    assert "camera.json: width" in gather(config).camera_fault
-    file.unlink()
-    assert str(file) in gather(config).camera_fault
-
-
-def test_a_user_without_rights_is_told_so(tmp_path: Path) -> None:
-    """What was seen on an installed machine: PermissionError, called a bug."""
-    closed = tmp_path / "closed"
-    (closed / "recordings").mkdir(parents=True)
-    code = (
-        "import os\n"
-        "from pathlib import Path\n"
-        "from services.doctor import facts\n"
-        "from services.recorder import recover\n"
-        "if os.geteuid() == 0:\n"
-        "    os.setgroups([])\n"
-        "    os.setuid(65534)\n"
-        f"folder = Path({str(closed / 'recordings')!r})\n"
-        "print(facts._closed((folder,)), facts._nearest(folder), facts._cut(folder))"
-    )
-    closed.chmod(0o000)
-    try:
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    finally:
-        closed.chmod(0o755)
-    assert str(closed / "recordings") in done.stdout, done.stderr
-    assert str(closed / "recordings") not in done.stdout.partition("]")[2]
-
-
-def test_a_machine_is_really_looked_at(tmp_path: Path) -> None:
-    now = dt.datetime.now(dt.UTC)
-    authority = Authority.create(tmp_path, now)
-    for name in ("uav1.slam", "uav1.reader"):
-        authority = authority.issue(Identity.parse(name), now, days=10)
-    (tmp_path / "uav1.slam.key").chmod(0o644)
-    recordings = tmp_path / "recordings"
-    recordings.mkdir()
-    (recordings / "a.mcap").write_bytes(b"\x89MCAP0\r\n")
-    config = TreedockConfig.model_validate({
-        "router": {"protocol": "tls", "port": 1}, "security": {"folder": tmp_path},
-        "recorder": RecorderConfig(folder=recordings), "camera": {"source": "tum:/nowhere"},
-    })  # fmt: skip
-    facts = gather(config)
-    assert facts.router is None
-    assert facts.certificates["uav1.slam"] == pytest.approx(10.0, abs=0.1)
-    assert facts.loose_keys == [str(tmp_path / "uav1.slam.key")]
-    assert facts.recordings_cut == [str(recordings / "a.mcap")]
-    assert facts.camera is None
-    assert facts.disk_free_bytes is not None
-
-
-def _nothing(folder: Path) -> None:
-    shutil.rmtree(folder)
-
-
-def _of_another_fleet(folder: Path) -> None:
-    now = dt.datetime.now(dt.UTC)
-    other = Authority.create(folder.parent / "other", now).issue(Identity.parse("uav1.slam"), now, days=100)
-    for end in (".pem", ".key"):
-        shutil.copy(other.folder / f"uav1.slam{end}", folder)
-
-
-def _revoked(folder: Path) -> None:
-    Authority.open(folder.parent / "fleet").revoke(Identity.parse("uav1.slam"))
-    shutil.copy(folder.parent / "fleet/identities.json", folder)
-
-
-@pytest.mark.parametrize(
-    ("spoil", "words"),
-    [
-        (_nothing, r"ca\.pem: No such file"),
-        (_of_another_fleet, r"uav1\.slam\.pem: is of another authority"),
-        (_revoked, r"uav1\.slam\.1 is revoked"),
-        (lambda folder: (folder / "uav1.slam.pem").write_text("x"), r"uav1\.slam\.pem: damaged"),
-        (lambda folder: (folder / "uav1.slam.key").unlink(), r"uav1\.slam\.key: No such file"),
-        (lambda folder: (folder / "uav1.slam.pem").unlink(), "holds no node's certificate"),
-        (lambda folder: (folder / "identities.json").write_text("x"), r"identities\.json: damaged"),
-    ],
-)
-def test_certificates_that_would_be_refused_are_found(
-    tmp_path: Path, spoil: Callable[[Path], object], words: str
-) -> None:
-    now = dt.datetime.now(dt.UTC)
-    slam = Identity.parse("uav1.slam")
-    Authority.create(tmp_path / "fleet", now).issue(slam, now, days=100).export([slam], tmp_path / "certs")
-    config = TreedockConfig.model_validate(
-        {"router": {"protocol": "tls", "port": 1}, "security": {"folder": tmp_path / "certs"}}
-    )
-    about = "certificates"
-    assert next(f for f in judge(gather(config)) if f.about == about).level == "ok"
-    spoil(tmp_path / "certs")
-    found = [f for f in judge(gather(config)) if f.about == "certificate"]
-    assert [f.level for f in found] == ["fail"]
-    assert re.search(words, found[0].text)
-    assert found[0].do
-    assert not any(f.about == about for f in judge(gather(config)))
-
-
-@pytest.mark.parametrize("fault", [FileNotFoundError("systemctl"), subprocess.TimeoutExpired("systemctl", 10.0)])
-def test_a_system_that_does_not_answer_is_no_bug(monkeypatch: pytest.MonkeyPatch, fault: Exception) -> None:
-    def run(*_: object, **__: object) -> None:
-        raise fault
-
-    monkeypatch.setattr("subprocess.run", run)
-    facts = gather(TreedockConfig.model_validate({"router": {"port": 1}}))
-    assert (facts.units, facts.clock_synchronised, facts.station) == ({}, None, False)
-
-
-def test_what_could_not_be_mended_is_not_called_fixed(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
-    def run(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
-        return subprocess.CompletedProcess(command, 1, "", "Unit treedock-slam.service not found.\n")
-
-    monkeypatch.setattr("subprocess.run", run)
-    broken = tmp_path / "a.mcap"
-    broken.write_bytes(b"not one at all")
-    facts = replace(
-        SOUND, loose_keys=("/nowhere/x.key",), recordings_cut=(str(broken),), units={"treedock-slam.service": "failed"}
-    )
-    assert not _mended(facts)
-    lines = capsys.readouterr().err.splitlines()
-    assert [line.partition(": ")[0] for line in lines] == ["not fixed"] * 3
-    assert "No such file" in lines[0]
-    assert lines[2] == "not fixed: systemctl restart treedock-slam.service: Unit treedock-slam.service not found."
-
-
-def test_fix_mends_and_the_report_is_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "cut.mcap").write_bytes(b"\x89MCAP0\r\n")
-    code = invoke(["doctor", "--fix", "--json", "--set", f"recorder.folder={tmp_path}", "--port", "1"])
-    said = capsys.readouterr()
-    report = json.loads(said.out)
-    assert code == 3, "no router"
-    assert report["fit"] is False
-    assert "cut.mcap" in said.err
-    assert not any(finding["about"] == "recordings" for finding in report["findings"])
