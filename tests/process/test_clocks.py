@@ -6,14 +6,19 @@ import contextlib
 import threading
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 
+from schemas.health import Health
+from schemas.simulation import SimClock
+from schemas.topics import HEALTH, SIM_CLOCK
 from services.common.config import TreedockConfig
 from services.common.runtime import run_service
 from services.common.session import free_port
 from services.common.stop import StopSignal
+from services.navigator.config import NavigatorConfig
 from services.router.config import RouterConfig
 from services.router.service import run as run_router
-from tests.process.conftest import HealthWatch, System, until
+from tests.process.conftest import HealthWatch, System, pump, until
 
 CLOSE_S = 0.1
 """A busy machine takes so long to deliver a message; the offsets are larger."""
@@ -62,3 +67,27 @@ def test_a_router_started_again_on_a_machine_whose_clock_was_set_goes_on_in_the_
             assert abs(off_s(watch, "slam")) < CLOSE_S
             with running("mapper", config(system.port, -60.0)):  # one that joins now is told the same
                 assert abs(off_s(watch, "mapper")) < CLOSE_S
+
+
+def test_in_a_simulation_five_times_as_fast_no_living_service_is_taken_for_dead(system: System) -> None:
+    """The navigator counts a service's silence in the simulation's time: 3.5 s of it are 0.7 s here."""
+    speed, heard_s = 5.0, [0.0]
+    tree = config(system.port, 0.0).model_copy(update={"clock": "sim"})
+    with running("router", config(system.port, 0.0)), running("mapper", tree), system.bus() as bus:
+        watch = HealthWatch(bus)
+        assert until(lambda: watch.state("mapper") == "ready", 20.0, bus)
+        begin_s, seq, simulated_s = time.monotonic(), 0, 0.0
+
+        def hear(health: Health) -> None:
+            if health.service == "mapper":
+                heard_s.append(simulated_s)
+
+        bus.subscribe(HEALTH, hear)
+        while simulated_s < 20.0:
+            simulated_s, seq = speed * (time.monotonic() - begin_s), seq + 1
+            bus.publish(SIM_CLOCK, SimClock(stamp_ns=round(simulated_s * 1e9), seq=seq, phase="running", frames=0))
+            time.sleep(0.01)
+            pump(bus)
+    silent_s = max(b - a for a, b in pairwise([*heard_s, simulated_s]))
+    assert silent_s < NavigatorConfig().failsafe.service_silent_s
+    assert len(heard_s) <= 30  # and no flood
