@@ -7,6 +7,7 @@ import ctypes
 import gc
 import os
 import signal
+import sys
 import tempfile
 import threading
 from collections.abc import Mapping
@@ -69,9 +70,13 @@ def give_way(nice: int) -> None:
 
 
 def give_back_memory() -> None:
-    """Give the machine back what was freed but is still held by the allocator (glibc; elsewhere nothing happens)."""
+    """Give the machine back what was freed but is still held by the allocator (glibc), and the pages of the kernels' compiler."""
     with contextlib.suppress(AttributeError, OSError):
         ctypes.CDLL(None).malloc_trim(0)
+    if "llvmlite" in sys.modules:
+        from services.common.library_pages import COMPILER, let_go_of
+
+        let_go_of(COMPILER)
 
 
 def take_small_arrays() -> None:

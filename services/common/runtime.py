@@ -327,6 +327,7 @@ def _serve(context: LiveContext, build: Build, stop: StopSignal) -> int:
     context.bus.declare_live(context.service)
     stop.when_set(context.inbox.wake)
     started()
+    give_back_memory()
     overdue = Overdue(context)
     sd_notify.notify("READY=1")
     LOG.info("ready")

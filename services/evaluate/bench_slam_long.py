@@ -15,9 +15,9 @@ import numpy as np
 
 from services.evaluate.bench import BenchOptions, BenchReport, code_version
 from services.evaluate.slam_live import Live, run_live
-from services.evaluate.slam_walk import CIRCUIT_M, LENGTH_M, render_walk
+from services.evaluate.slam_walk import CIRCUIT_M, FRAMES, LENGTH_M, render_walk
 
-FRAMES, QUICK_FRAMES = 6000, 600
+QUICK_FRAMES = 600
 RATE_HZ = 30.0
 SEED = 1
 _TELL_EVERY = 500
@@ -92,7 +92,7 @@ def _report(live: Live, frames: int, seed: int) -> BenchReport:
             "start_s": round(live.first_pose_s, 2),
         },
         conditions={
-            "walk": f"{frames} frames, {LENGTH_M:g} m at 1 m/s on a circuit of {CIRCUIT_M:g} m, forest of seed {seed}, 640x480 "
+            "walk": f"{frames} frames, {LENGTH_M * frames / FRAMES:g} m at 1 m/s on a circuit of {CIRCUIT_M:g} m, forest of seed {seed}, 640x480 "
             "rendered at half size, s 0.08 px",
             "service": f"`treedock slam` and a router as processes, raw frames over Zenoh at {RATE_HZ:g} Hz, 1000 features, map kept on disk",
             "cores": "CPU time of all threads of the slam process over the walk's length; a frame is sent when the one before is answered",
@@ -110,7 +110,7 @@ def _parts(live: Live, frames: int) -> list[str]:
         inside = np.flatnonzero((index >= begin) & (index < end))
         track = _percentiles(np.array(live.track_ms)[inside].tolist())
         latency = _percentiles(np.array(live.latency_ms)[inside].tolist())
-        a, b = looks * begin // frames, looks * end // frames
+        a, b = round(looks * begin / frames), round(looks * end / frames)
         seconds = live.walk_s * (b - a) / looks
         lines.append(
             f"| {begin} to {end} | {track[0]:.1f} | {track[1]:.1f} | {track[2]:.0f} | {latency[0]:.1f} | {latency[1]:.1f} "

@@ -22,6 +22,8 @@ from services.simulator.scene import Backdrop, Ground, Scene, SceneTree, Wave
 F64 = NDArray[np.float64]
 
 CIRCUIT_M, LENGTH_M = 180.0, 200.0
+FRAMES = 6000
+"""Of the whole walk: 1 m/s at 30 Hz. A shorter one is its beginning."""
 HEIGHT_M = 1.5
 _RADIUS_M = CIRCUIT_M / (2.0 * math.pi)
 _HALF_WIDTH_M = 9.0
@@ -95,7 +97,7 @@ def render_walk(path: Path, seed: int, frames: int, progress: Callable[[int], No
     T_map_world = inverse(map_frame(walk_pose(scene, 0.0)))
     with path.open("ab") as file:
         for index in range(done, frames):
-            T = walk_pose(scene, LENGTH_M * index / frames)
+            T = walk_pose(scene, LENGTH_M * index / FRAMES)
             images = sensor.expose(renderer.render(T), index)
             grey = cv2.cvtColor(images.colour, cv2.COLOR_BGR2GRAY)
             jpeg = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
