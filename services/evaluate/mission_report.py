@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 
 from schemas.health import Health
 from schemas.navigation import MissionState
-from schemas.trees import Target, Tree
+from schemas.trees import Tree
+from services.common.geometry import Matrix
 from services.evaluate.exports import Stamped
 from services.evaluate.report import STYLE, filters_section, table, tree_table, trunks_section
+from services.evaluate.sightings import Sightings, sightings
 from services.evaluate.timeline import timeline_svg
 from services.evaluate.top_view import top_view_svg
 
@@ -34,7 +36,8 @@ class Story:
     map_id: str = ""
     trajectory: list[Stamped] = field(default_factory=list)
     trees: tuple[Tree, ...] = ()
-    targets: list[Target] = field(default_factory=list)
+    seen: Sightings = field(default_factory=sightings)
+    """Of the target, in each frame."""
     states: list[MissionState] = field(default_factory=list)
     """One per change of state or reason."""
     health: dict[str, Health] = field(default_factory=dict)
@@ -49,10 +52,10 @@ def mission_report(story: Story) -> bytes:
         "<!doctype html>", '<html lang="en"><head><meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width">', f"<title>{html.escape(title)}</title>",
         f"<style>{STYLE}</style></head><body>", f"<h1>{html.escape(title)}</h1>", _verdict(story), _cards(story),
-        "<h2>What happened</h2>", timeline_svg(story.states, story.targets), _events(story.states), *_choice(story),
+        "<h2>What happened</h2>", timeline_svg(story.states, story.seen), _events(story.states), *_choice(story),
         "<h2>Trees</h2>", tree_table(story.trees),
         "<h2>From above</h2>", top_view_svg(story.trees, story.trajectory, story.points_m),
-        *trunks_section(story.trees, story.points_m), *filters_section(story.targets), *_services(story.health),
+        *trunks_section(story.trees, story.points_m), *filters_section(story.seen), *_services(story.health),
         "</body></html>",
     ]  # fmt: skip
     return ("\n".join(body) + "\n").encode()
@@ -132,16 +135,7 @@ def _services(health: dict[str, Health]) -> list[str]:
     return ["<h2>Services at the end</h2>", table(("service", "state", "ms (median)", "counted", "note"), rows, left=5)]
 
 
-def thinned(trajectory: Sequence[Stamped], step_m: float = 0.02) -> list[Stamped]:
-    """Return the poses that are at least ``step_m`` or ten degrees apart, first and last included."""
-    kept: list[Stamped] = []
-    for stamp_ns, T in trajectory:
-        if kept:
-            last = kept[-1][1]
-            angle = math.acos(min(1.0, max(-1.0, 0.5 * (float(np.trace(last[:3, :3].T @ T[:3, :3])) - 1.0))))
-            if float(np.linalg.norm(T[:3, 3] - last[:3, 3])) < step_m and angle < math.radians(10.0):
-                continue
-        kept.append((stamp_ns, T))
-    if trajectory and kept[-1][0] != trajectory[-1][0]:
-        kept.append(trajectory[-1])
-    return kept
+def far_apart(one: Matrix, other: Matrix, step_m: float = 0.02) -> bool:
+    """Return whether two poses (4, 4) are ``step_m`` or ten degrees apart: as close as a picture of the path needs them."""
+    cosine = 0.5 * (float(np.trace(one[:3, :3].T @ other[:3, :3])) - 1.0)
+    return float(np.linalg.norm(other[:3, 3] - one[:3, 3])) >= step_m or cosine <= math.cos(math.radians(10.0))

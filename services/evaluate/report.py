@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.trees import Target, Tree
+from schemas.trees import Tree
 from services.evaluate.exports import Stamped, tree_rows
 from services.evaluate.report_pictures import cross_section_svg, filter_plots_svg
+from services.evaluate.sightings import Sightings
 from services.evaluate.top_view import top_view_svg
 
 _MAX_PICTURES = 60
@@ -46,10 +47,10 @@ def report_bytes(
     trees: Sequence[Tree],
     trajectory: Sequence[Stamped],
     points_m: NDArray[np.float32],
-    targets: Sequence[Target] = (),
+    seen: Sightings | None = None,
     more: Sequence[str] = (),
 ) -> bytes:
-    """Return the page for a run's metrics ``values``, its trees, final trajectory, map points (N, 3) and targets.
+    """Return the page for a run's metrics ``values``, its trees, final trajectory, map points (N, 3) and what was seen of the target.
 
     ``more``: lines of HTML that stand before the target's section.
     """
@@ -58,7 +59,7 @@ def report_bytes(
         "<!doctype html>", '<html lang="en"><head><meta charset="utf-8">', f"<title>{html.escape(title)}</title>",
         f"<style>{STYLE}</style></head><body>", f"<h1>{html.escape(title)}</h1>", _summary(values), *bad,
         "<h2>Trees</h2>", tree_table(trees), "<h2>From above</h2>", top_view_svg(trees, trajectory, points_m),
-        *trunks_section(trees, points_m), *more, *filters_section(targets), "<h2>Time</h2>", _timings(values["ms"]),
+        *trunks_section(trees, points_m), *more, *filters_section(seen), "<h2>Time</h2>", _timings(values["ms"]),
         "<h2>Files beside this page</h2>", table(("file", "what it is"), _FILES, left=2), "</body></html>",
     ]  # fmt: skip
     return ("\n".join(body) + "\n").encode()
@@ -118,9 +119,9 @@ def trunks_section(trees: Sequence[Tree], points_m: NDArray[np.float32]) -> list
     return ["<h2>Trunks</h2>", f"<p>{words}{left_out}</p>", '<section class="trunks">', *pictures, "</section>"]
 
 
-def filters_section(targets: Sequence[Target]) -> list[str]:
+def filters_section(seen: Sightings | None) -> list[str]:
     """Return the filters' work over time, nothing when no target was tracked."""
-    plots = filter_plots_svg(targets)
+    plots = "" if seen is None else filter_plots_svg(seen)
     return ["<h2>Target</h2>", plots] if plots else []
 
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import html
-import itertools
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.trees import Target, Tree
+from schemas.trees import Tree
+from services.evaluate.sightings import Sightings
 
 _SLICE_HALF_M = 0.10
 """Half the height of the slice that a cross-section shows."""
@@ -61,25 +60,24 @@ def _slice(points_m: NDArray[np.float32], centre: NDArray[np.float64], half_m: f
     return found[:: max(1, len(found) // _MAX_POINTS)]
 
 
-def filter_plots_svg(targets: Sequence[Target]) -> str:
+def filter_plots_svg(seen: Sightings) -> str:
     """Return the three filtered quantities over time: raw as dots, filtered as a line; empty when nothing was tracked."""
-    tracked = [t for t in targets if t.status == "tracking"]
+    tracked = seen[seen["tracking"]]
     if len(tracked) < 2:
         return ""
-    begin_ns = targets[0].stamp_ns
-    seconds = np.array([1e-9 * (t.stamp_ns - begin_ns) for t in tracked])
-    other = [False, *(a.tree_id != b.tree_id for a, b in itertools.pairwise(tracked))]
-    breaks = np.array(other) | np.concatenate([[True], np.diff(seconds) > _GAP_S])
+    seconds = 1e-9 * (tracked["stamp_ns"] - seen["stamp_ns"][0])
+    other = np.diff(tracked["tree_id"], prepend=tracked["tree_id"][0]) != 0
+    breaks = other | np.concatenate([[True], np.diff(seconds) > _GAP_S])
     rows = [
-        ("x in the image (px)", 1.0, [t.raw_image_x_px for t in tracked], [t.image_x_px for t in tracked]),
-        ("range (m)", 1.0, [t.raw_range_m for t in tracked], [t.range_m for t in tracked]),
-        ("radius (cm)", 100.0, [t.raw_radius_m for t in tracked], [t.radius_m for t in tracked]),
+        ("x in the image (px)", 1.0, "image_x_px"),
+        ("range (m)", 1.0, "range_m"),
+        ("radius (cm)", 100.0, "radius_m"),
     ]
     # what was never measured (a source that tells no pixels) has no plot
-    rows = [row for row in rows if np.isfinite(_numbers([*row[2], *row[3]], 1.0)).any()]
+    rows = [row for row in rows if np.isfinite([tracked[row[2]], tracked[f"raw_{row[2]}"]]).any()]
     plots = [
-        _plot(k, name, seconds, _numbers(raw, factor), _numbers(filtered, factor), breaks)
-        for k, (name, factor, raw, filtered) in enumerate(rows)
+        _plot(k, name, seconds, factor * tracked[f"raw_{field}"], factor * tracked[field], breaks)
+        for k, (name, factor, field) in enumerate(rows)
     ]
     height = len(rows) * (_PLOT_HEIGHT_PX + 24.0) + 22.0
     legend = (
@@ -88,10 +86,6 @@ def filter_plots_svg(targets: Sequence[Target]) -> str:
     )
     head = f'<svg viewBox="0 0 {_PLOT_PX:.0f} {height:.0f}" role="img" aria-label="raw and filtered target" font-size="12">'
     return "\n".join([head, *plots, legend, "</svg>"])
-
-
-def _numbers(values: Sequence[float | None], factor: float) -> NDArray[np.float64]:
-    return np.array([np.nan if v is None else factor * v for v in values], dtype=float)
 
 
 def _plot(

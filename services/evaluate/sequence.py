@@ -15,6 +15,7 @@ from services.evaluate.atomic import prepare, write_files
 from services.evaluate.metrics import metrics, metrics_bytes
 from services.evaluate.offline import Counts, OfflineResult, run_offline
 from services.evaluate.report import report_bytes
+from services.evaluate.sightings import sightings
 
 if TYPE_CHECKING:
     from services.common.config import TreedockConfig
@@ -120,7 +121,13 @@ def result_files(
         "targets.jsonl": exports.targets_jsonl(result.targets),
         "metrics.json": metrics_bytes(values),
         "report.html": report_bytes(
-            f"treedock: {title}", values, result.trees, result.trajectory, result.points_m, result.targets, section
+            f"treedock: {title}",
+            values,
+            result.trees,
+            result.trajectory,
+            result.points_m,
+            sightings(result.targets),
+            section,
         ),
     }
 

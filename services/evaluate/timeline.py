@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from schemas.navigation import MissionState
-from schemas.trees import Target
+from services.evaluate.sightings import Sightings, sightings
 
 _WIDTH_PX, _BAR_PX, _PLOT_PX, _LEFT_PX = 720.0, 34.0, 130.0, 62.0
 _INK, _FAINT, _LINE, _BAND = "#1d2a20", "#5c6b60", "#15803d", "#bbf7d0"
@@ -25,16 +25,17 @@ _LETTER_PX = 6.8
 _GAP_S = 0.5
 
 
-def timeline_svg(states: Sequence[MissionState], targets: Sequence[Target] = ()) -> str:
+def timeline_svg(states: Sequence[MissionState], seen: Sightings | None = None) -> str:
     """Return the picture; empty when fewer than two states were told."""
     if len(states) < 2 or states[-1].stamp_ns <= states[0].stamp_ns:
         return ""
     begin_ns, end_ns = states[0].stamp_ns, states[-1].stamp_ns
     scale = (_WIDTH_PX - _LEFT_PX - 6.0) / (end_ns - begin_ns)
-    ranges = [
-        (t.stamp_ns, t.range_m) for t in targets
-        if t.status == "tracking" and t.range_m is not None and begin_ns <= t.stamp_ns <= end_ns
-    ]  # fmt: skip
+    seen = sightings() if seen is None else seen
+    shown = (
+        seen["tracking"] & np.isfinite(seen["range_m"]) & (begin_ns <= seen["stamp_ns"]) & (seen["stamp_ns"] <= end_ns)
+    )
+    ranges = list(zip(seen["stamp_ns"][shown].tolist(), seen["range_m"][shown].tolist(), strict=True))
     height = 20.0 + _BAR_PX + (18.0 + _PLOT_PX if len(ranges) > 1 else 0.0) + 22.0
     parts = [
         f'<svg viewBox="0 0 {_WIDTH_PX:.0f} {height:.0f}" role="img" aria-label="states over time" font-size="12">'

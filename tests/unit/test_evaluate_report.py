@@ -11,6 +11,7 @@ import pytest
 
 from schemas.trees import Target, Tree, TreeList
 from services.evaluate.report_pictures import cross_section_svg, filter_plots_svg
+from services.evaluate.sightings import sightings
 from tests.examples import all_messages
 
 
@@ -77,16 +78,16 @@ def test_lines_break_where_another_tree_is_tracked_or_none_for_a_while() -> None
     targets = (
         [target(n) for n in range(20)] + [target(n, 8) for n in range(20, 40)] + [target(n, 8) for n in range(60, 80)]
     )
-    svg = filter_plots_svg(targets)
+    svg = filter_plots_svg(sightings(targets))
     lines = [p.attrib["d"] for p in ET.fromstring(svg).iter("path") if p.attrib["d"].count("L") > 5]
     assert [line.count("M") for line in lines] == [3, 3, 3]
 
 
 def test_frames_without_a_measurement_have_no_dot() -> None:
     targets = [target(n, raw_range_m=None, raw_radius_m=None, raw_image_x_px=None) for n in range(10)]
-    assert len(re.findall(r'r="1\.6"', filter_plots_svg(targets))) == 0
+    assert len(re.findall(r'r="1\.6"', filter_plots_svg(sightings(targets)))) == 0
 
 
 @pytest.mark.parametrize("targets", [[], [target(1)], [target(n, status="lost") for n in range(9)]])
 def test_nothing_tracked_gives_no_plot(targets: list[Target]) -> None:
-    assert filter_plots_svg(targets) == ""
+    assert filter_plots_svg(sightings(targets)) == ""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
+import tracemalloc
 from pathlib import Path
 from typing import Any, cast
 from xml.etree import ElementTree as ET
@@ -16,9 +18,13 @@ from schemas.topics import MISSION_STATE, SLAM_POSE, TREES_LIST, TREES_TARGET
 from schemas.trees import Target, TreeList
 from services.common.config import TreedockConfig
 from services.common.context import Context
+from services.common.geometry import pose as matrix
+from services.common.geometry import rotation_z
 from services.common.memory import Hub
-from services.evaluate.mission_report import Story, mission_report, thinned
+from services.evaluate.mission_report import Story, mission_report
+from services.evaluate.sightings import sightings
 from services.recorder.chronicle import Chronicle
+from services.recorder.chronicle import Path as FlownPath
 from services.recorder.config import RecorderConfig
 from services.recorder.service import build
 from tests.examples import all_messages, submap, without_points
@@ -113,7 +119,7 @@ def test_the_page_says_how_it_ended_and_shows_it_over_time() -> None:
         for k in range(10)
     ]
     page = mission_report(
-        Story(uav="uav1", states=list(MISSION), trees=example(TreeList).trees, targets=targets)
+        Story(uav="uav1", states=list(MISSION), trees=example(TreeList).trees, seen=sightings(targets))
     ).decode()
     assert "Docked at 1 tree. Ended landed: on the ground." in page
     assert 'class="verdict good"' in page
@@ -167,11 +173,39 @@ def test_another_mission_begins_the_path_anew_and_an_hour_of_them_is_not_piled_u
 
 
 def test_thinning_keeps_shape_and_ends() -> None:
-    line = [(n, np.eye(4)) for n in range(1000)]
-    for n, T in line:
-        T[0, 3] = 0.001 * n
-    kept = thinned(line)
+    path = FlownPath()
+    assert path.poses() == []
+    for n in range(1000):
+        path.add(n, matrix(np.eye(3), [0.001 * n, 0.0, 0.0]))
+    kept = path.poses()
     assert kept[0][0] == 0
     assert kept[-1][0] == 999
+    assert kept[-1][1][0, 3] == pytest.approx(0.999)
     assert 45 <= len(kept) <= 60
-    assert thinned([]) == []
+    for degrees in range(360):
+        path.add(1000 + degrees, matrix(rotation_z(math.radians(degrees)), [0.999, 0.0, 0.0]))
+    assert 32 <= len(path.poses()) - len(kept) <= 36
+
+
+def test_a_day_of_missions_takes_the_room_of_the_longest() -> None:
+    chronicle = Chronicle("uav1")
+
+    def fly(mission: int) -> None:
+        chronicle.hear(state("scan", "on", 200.0 * mission))
+        for k in range(2000):
+            seconds = 200.0 * mission + 0.06 * k
+            chronicle.hear(pose(seconds, 0.05 * k))
+            chronicle.hear(example(Target).model_copy(update={"stamp_ns": round(seconds * SECOND)}))
+        chronicle.hear(state("landed", "down", 200.0 * mission + 160.0))
+
+    fly(0)
+    story = chronicle.story()
+    assert (len(story.trajectory), len(story.seen)) == (2000, 2000)
+    del story
+    tracemalloc.start()
+    for mission in range(1, 4):
+        fly(mission)
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(chronicle.story().trajectory) == 2000
+    assert held < 100e3
