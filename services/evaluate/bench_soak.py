@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -53,13 +54,24 @@ def run(options: BenchOptions) -> BenchReport:
 
             seed = _SEED if options.seed is None else options.seed
             with tempfile.TemporaryDirectory(prefix="treedock-soak-") as folder:
-                if kind == "chain":
-                    _soak_chain(Path(folder), seed, 60.0 * minutes, write, options.tell)
-                else:
-                    speed = _HALF_SPEED if "half-speed" in options.scenes else _SPEED
-                    _soak_flights(Path(folder), seed, 60.0 * minutes, write, options.tell, speed)
+                try:
+                    if kind == "chain":
+                        _soak_chain(Path(folder), seed, 60.0 * minutes, write, options.tell)
+                    else:
+                        speed = _HALF_SPEED if "half-speed" in options.scenes else _SPEED
+                        _soak_flights(Path(folder), seed, 60.0 * minutes, write, options.tell, speed)
+                finally:
+                    _keep_logs(Path(folder), options.out / f"soak-{kind}-logs")
         rows = _read(path, version)
     return report_of(rows, kind, version)
+
+
+def _keep_logs(folder: Path, kept: Path) -> None:
+    """Save what the services said and the recordings' last files: a touch has to be understood afterwards."""
+    shutil.rmtree(kept, ignore_errors=True)
+    kept.mkdir(parents=True)
+    for file in (*folder.glob("*.log"), *(folder / "recordings").glob("*")):
+        shutil.move(file, kept)
 
 
 def _read(path: Path, version: str) -> list[dict[str, Any]]:

@@ -7,6 +7,7 @@ hung one only for ``hung_after_s``; while somebody is missing, simulated time is
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 from typing import Literal
@@ -42,6 +43,8 @@ from services.simulator.px4.simulated import SimulatedPx4
 from services.simulator.px4.warm import warm
 from services.simulator.scene import Floats, Scene
 from services.simulator.stage import Stage
+
+LOG = logging.getLogger(__name__)
 
 _TURN_S = 0.002
 """Wall time between two steps at least: the bridge has its say in between."""
@@ -186,7 +189,11 @@ class Flight:
         if self.px4.on_ground and not self.px4.armed:
             self._flown = False  # armed once more it stands, and has not come down
         bumped = self._flown and self.px4.on_ground and self.px4.armed and self.px4.mode not in _LANDING
-        self.stage.touches.update(self.stage.world.clearance_of_things(T_world_camera[:3, 3]), bumped=bumped)
+        clearance_m = self.stage.world.clearance_of_things(T_world_camera[:3, 3])
+        if self.stage.touches.update(clearance_m, bumped=bumped):
+            what = "the ground" if bumped else f"something, {clearance_m:.2f} m from the camera"
+            mode, phase_s = self.px4.mode.name.lower(), self.px4.elapsed_s
+            LOG.warning("touched %s at (%.2f, %.2f, %.2f) m in mode %s after %.2f s", what, x, y, z, mode, phase_s)
 
     def _publish_clock(self) -> None:
         self._ticks += 1

@@ -16,16 +16,18 @@ class Touches:
         self.smallest_m = math.inf
         """Smallest clearance since take-off; before that the present one."""
 
-    def update(self, clearance_m: float, *, bumped: bool = False) -> None:
+    def update(self, clearance_m: float, *, bumped: bool = False) -> bool:
         """Take the present distance from the aircraft's centre to the nearest surface.
 
-        ``bumped``: it hit the ground although it was not landing.
+        ``bumped``: it hit the ground although it was not landing. Return whether a touch began.
         """
         if not self._airborne:
             self._airborne = clearance_m > self._radius_m
             self.smallest_m = clearance_m
-            return
+            return False
         self.smallest_m = min(self.smallest_m, clearance_m)
         touching = bumped or clearance_m < self._radius_m
-        self.count += touching and not self._touching
+        began = touching and not self._touching
+        self.count += began
         self._touching = touching
+        return began

@@ -135,7 +135,7 @@ def test_clearance_is_the_distance_to_the_nearest_surface() -> None:
 
 def test_touches_are_counted_from_take_off_on() -> None:
     touches = Touches(0.25)
-    for clearance in (0.1, 0.1, 0.5, 1.0, 0.2, 0.1, 0.4, 0.24):
-        touches.update(clearance)
+    began = [touches.update(clearance) for clearance in (0.1, 0.1, 0.5, 1.0, 0.2, 0.1, 0.4, 0.24)]
+    assert began == [False, False, False, False, True, False, False, True]
     assert touches.count == 2
     assert touches.smallest_m == 0.1
