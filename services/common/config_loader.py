@@ -19,6 +19,7 @@ from pydantic import BaseModel, ValidationError
 from services.common.config import TreedockConfig
 from services.common.config_versions import current
 from services.common.errors import InputError
+from services.common.unit_slips import slip
 
 SYSTEM_DIRECTORY = Path("/etc/treedock")
 _PREFIX = "TREEDOCK_"
@@ -173,6 +174,10 @@ def _assemble(settings: list[_Setting]) -> LoadedConfig:
         config = TreedockConfig.model_validate(tree)
     except ValidationError as error:
         raise InputError(_fault(error, values)) from None
+    defaults = TreedockConfig()
+    for key, setting in values.items():
+        if word := slip(defaults, config, key):
+            raise InputError(f"{setting.origin}: {key} = {setting.value!r}: {word}")
     return LoadedConfig(config, {key: setting.origin for key, setting in values.items()})
 
 

@@ -131,10 +131,26 @@ def test_a_rule_of_ours_names_the_file_and_speaks_plainly(tmp_path: Path, text: 
     ("autopilot.setpoint_reach_m", "inf"),
     ("autopilot.camera_pitch_rad", "-20"),
     ("autopilot.camera_offset_m", "[100, 0, 30]"),
+    ("refiner.filter.lost_after_s", "500"),
+    ("refiner.filter.lost_after_s", '"500"'),
+    ("slam.max_depth_m", "6000"),
+    ("slam.max_depth_m", "nan"),
+    ("fusion.jump_rad", "3"),  # degrees
+    ("fusion.second.camera.stall_s", "1000"),
+    ("supervisor.hung_after_s", "10000"),
+    ("simulator.start_m", "[0.0, inf]"),
 ])  # fmt: skip
 def test_a_limit_in_the_wrong_unit_is_refused_not_a_failsafe_less(tmp_path: Path, key: str, value: str) -> None:
     with pytest.raises(InputError, match=rf"--set {key}: {key}"):
         load(flags=[f"{key}={value}"], environ={}, system_directory=tmp_path)
+
+
+@pytest.mark.parametrize(("key", "value"), [
+    ("slam.map_max_age_s", "86400"), ("supervisor.mission_within_s", "7200"), ("simulator.flight.limit_s", "1e9"),
+    ("autopilot.origin_alt_m", "1500"), ("navigator.dock.hold_s", "120"), ("slam.new_map_after_s", "0.5"),
+])  # fmt: skip
+def test_a_bold_choice_is_no_slip(tmp_path: Path, key: str, value: str) -> None:
+    assert load(flags=[f"{key}={value}"], environ={}, system_directory=tmp_path).origins[key]
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become a user without rights")
