@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from services.camera.depth.config import DepthConfig
 
@@ -72,6 +72,14 @@ class CameraConfig(BaseModel):
     compressed_depth: Literal["png", "zstd"] = "zstd"
     """Depth of compressed frames, lossless. PNG takes six to fifteen times the processor time and is no smaller
     (fr1_desk: 9.4 ms and 113 KB against 1.7 ms and 94 KB)."""
+
+    @field_validator("source")
+    @classmethod
+    def _known(cls, source: str) -> str:
+        kind, _, where = source.partition(":")
+        if source not in {"sim", "realsense"} and not (kind in {"tum", "mcap", "bag"} and where):
+            raise ValueError("expected sim, tum:DIR, mcap:FILE, bag:FILE or realsense")
+        return source
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

@@ -77,6 +77,8 @@ def test_a_file_can_be_named_by_a_variable(tmp_path: Path) -> None:
         ("slam = 5\n", ("slam", "section")),
         ('uav = "a/b"\n', ("uav = 'a/b'",)),
         ("[camera]\nmin_range_m = 9.0\n", ("camera", "min_range_m 9.0")),
+        ("[camera]\nsource = 'relasense'\n", ("camera.source = 'relasense'", "bag:FILE or realsense")),
+        ("[camera]\nsource = 'tum:'\n", ("camera.source = 'tum:'", "tum:DIR")),
     ],
 )
 def test_a_mistake_names_the_file_and_the_key(tmp_path: Path, text: str, words: tuple[str, ...]) -> None:
