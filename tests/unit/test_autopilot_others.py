@@ -64,6 +64,35 @@ def test_another_who_falls_silent_in_time_is_forgiven() -> None:
     assert "holding" not in rig.bridge.state(rig.now_ns).note
 
 
+@pytest.mark.parametrize("other", [{"engage": False, "mission_id": 0}, {"engage": True, "mission_id": 9, "land": True}])
+def test_a_second_navigator_neither_steers_nor_stops_the_mission_that_is_flown(other: dict[str, Any]) -> None:
+    rig = Rig()
+    rig.engage()
+    rig.setpoint = (np.array([0.5, 0.0, 1.0]), 0.0, np.zeros(3), 0.0)
+    rig.run(0.2)
+    own = rig.guidance
+    for _ in range(200):
+        rig.guidance = other
+        rig.bridge.on_guidance(rig.guidance_message(), rig.now_ns)
+        rig.guidance = own
+        assert all(m.x == pytest.approx(0.5) for m in rig.setpoints(0.01))
+    assert rig.bridge.engagement.of_others == 200
+    assert "stop one of them" in rig.bridge.engagement.others_word(rig.now_ns)
+    rig.run(3.5)
+    assert rig.bridge.engagement.others_word(rig.now_ns) == ""
+
+
+def test_a_navigator_that_was_started_again_is_heard_once_the_old_one_is_silent() -> None:
+    rig = Rig()
+    rig.engage()
+    rig.guidance = {"engage": False, "mission_id": 0}
+    rig.run(0.05)
+    assert rig.bridge.engagement.usable(rig.now_ns) is not None
+    rig.run(rig.bridge.config.guidance_stale_s + 0.1)
+    assert rig.bridge.engagement.usable(rig.now_ns) is None
+    assert "holding" in rig.bridge.state(rig.now_ns).note
+
+
 def test_nobody_engages_beside_another() -> None:
     rig = Rig()
     rig.guidance = {"engage": False, "mission_id": 1}

@@ -19,6 +19,7 @@ Order = Literal["offboard", "arm", "land", "disarm"]
 _STREAMING: frozenset[Phase] = frozenset({"streaming", "switching", "arming", "engaged"})
 _REPEAT_S = 0.5
 _DISARM_AFTER_S = 4.0
+_OTHERS_TOLD_S = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +65,9 @@ class Engagement:
         self._mode_ns = 0
         self._just_told = False
         """The mode is of this very moment: a pilot's switch that we do not know of would be overridden by what we ask."""
+        self.of_others = 0
+        """Guidance of another mission than the one that is flown."""
+        self._others_ns: int | None = None
         self._mode_before = ""
         """The mode in which the vehicle stood when we began: the pilot changes it to say no."""
 
@@ -83,7 +87,15 @@ class Engagement:
         return self.phase == "released"
 
     def on_guidance(self, guidance: Guidance, vehicle: Vehicle, now_ns: int) -> None:
-        """Take guidance. A new mission engages on the step from engage off to on, seen by us, vehicle disarmed."""
+        """Take guidance. A new mission engages on the step from engage off to on, seen by us, vehicle disarmed.
+
+        While one mission is flown by fresh guidance, that of another is a second navigator's: counted, and left alone.
+        """
+        flown = self.phase not in ("quiet", "released") and self.usable(now_ns) is not None
+        if flown and guidance.mission_id != self.mission_id:
+            self.of_others += 1
+            self._others_ns = now_ns
+            return
         before, self._guidance, self._heard_ns = self._guidance, guidance, now_ns
         if not guidance.engage or guidance.mission_id <= self.mission_id:
             return
@@ -96,6 +108,12 @@ class Engagement:
         else:
             why = "it was under way when the bridge was started" if not rising else "the vehicle is not free"
             self.note = f"mission {guidance.mission_id} is not engaged: {why}"
+
+    def others_word(self, now_ns: int) -> str:
+        """Return what is to be told of another navigator that spoke lately, empty when none did."""
+        if self._others_ns is None or (now_ns - self._others_ns) / 1e9 > _OTHERS_TOLD_S:
+            return ""
+        return "a second navigator speaks, of another mission than the one that is flown: stop one of them"
 
     def usable(self, now_ns: int) -> Guidance | None:
         """Return the guidance to follow, or None when the aircraft has to hold."""

@@ -97,6 +97,8 @@ class Autopilot:
             book.counters["timesync_round_trip_us"] = bridge.clocks.round_trip_ns // 1000
         book.note("clocks", bridge.clocks.word(now_ns))
         book.note("controls", bridge.foreign.word(now_ns))
+        book.note("navigators", bridge.engagement.others_word(now_ns))
+        book.counters["guidance_of_others"] = bridge.engagement.of_others
         book.note("link", "" if state.connected else "no word from the autopilot: is it running, is the address right?")
         book.note("wire", getattr(self._link, "failed", ""))
         book.counters["mavlink_bad"] = getattr(self._link, "bad", 0)
