@@ -10,7 +10,8 @@ import zenoh
 
 from services.common.config import TreedockConfig
 from services.common.errors import InputError
-from services.common.runtime import LiveContext, run_service
+from services.common.live_context import LiveContext
+from services.common.runtime import run_service
 from services.common.session import memory_settings, opened, router_config, split_endpoint, why_not_listen
 from services.common.stop import StopSignal
 from services.router.keeper import TimeKeeper

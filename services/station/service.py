@@ -42,7 +42,7 @@ from schemas.topics import (
 from schemas.trees import TreeList
 from services.common.bus import Bus
 from services.common.health import HealthReporter
-from services.common.runtime import LiveContext
+from services.common.live_context import LiveContext
 from services.navigator.client import send_command
 from services.station.aircraft import Aircraft
 from services.station.brain import Brain, Outgoing

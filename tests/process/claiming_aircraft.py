@@ -12,7 +12,8 @@ import numpy as np
 from schemas.topics import MISSION_STATE, TREES_LIST
 from schemas.trees import Tree
 from services.common.config import TreedockConfig
-from services.common.runtime import LiveContext, run_service
+from services.common.live_context import LiveContext
+from services.common.runtime import run_service
 from services.common.stop import end_process
 from services.fleet.config import ClaimConfig
 from services.fleet.holder import ClaimView

@@ -119,7 +119,8 @@ def test_undecodable_samples_are_counted_and_never_fatal(routed: System) -> None
             (b"x" * 4000, "text/plain"),
             (bytes(17 << 20), encoding),
         ):
-            bus.session.put(key, payload, encoding=said)
+            # on a busy machine 17 MB would else be dropped on the way
+            bus.session.put(key, payload, encoding=said, congestion_control=zenoh.CongestionControl.BLOCK)
             time.sleep(0.1)
         assert until(lambda: health.counter("slam", "decode_errors.camera/rgbd") == 4, bus=bus)
         assert slam.poll() is None

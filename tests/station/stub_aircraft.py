@@ -35,7 +35,8 @@ from schemas.trees import Tree, TreeList
 from services.common.config import TreedockConfig
 from services.common.geometry import wrap_angle
 from services.common.health import HealthReporter
-from services.common.runtime import LiveContext, run_service
+from services.common.live_context import LiveContext
+from services.common.runtime import run_service
 from services.common.stop import end_process
 from services.navigator.commands import CommandDesk
 from services.router.config import RouterConfig

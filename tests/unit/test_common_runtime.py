@@ -13,7 +13,8 @@ from schemas.topics import CAMERA_RGBD, SLAM_POSE, TREES_LIST
 from services.common.clock import SimulatedClock
 from services.common.config import TreedockConfig
 from services.common.errors import InputError
-from services.common.runtime import LiveContext, Overdue
+from services.common.live_context import LiveContext
+from services.common.overdue import Overdue
 
 
 def live(clock: SimulatedClock | None = None) -> LiveContext:
