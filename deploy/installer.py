@@ -127,9 +127,8 @@ def _environment(options: Options) -> Iterator[Action]:
     prefix = options.at(options.prefix)
     python = str(prefix / "bin/python")
     yield Folder(prefix / MARK)  # first of all: also what is left of an attempt that broke off is known as ours
-    new = not Path(
-        python
-    ).exists()  # also when the system's Python became another: what was installed for the old is lost
+    # also when the system's Python became another: what was installed for the old is lost
+    new = not Path(python).exists()
     yield Run((sys.executable, "-m", "venv", str(prefix)), "a private environment", needed=new)
     offline = ("--no-index", "--find-links", str(options.wheels)) if options.wheels else ()
     stamp, wanted = prefix / STAMP, source_hash()
@@ -215,7 +214,13 @@ def parse(arguments: Sequence[str]) -> tuple[str, Options]:
     parser = argparse.ArgumentParser(prog="deploy/install", description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("verb", nargs="?", choices=("install", "uninstall"), default="install")
     parser.add_argument("--prefix", default=units.PREFIX, help="place of the private environment (default %(default)s)")
-    parser.add_argument("--root", type=Path, default=Path("/"), help="stage below this folder instead of installing")
+    parser.add_argument(
+        "--root",
+        type=Path,
+        default=Path("/"),
+        help="lay everything out below this folder, to look at or to test: no user is made, nothing is activated, and "
+        "the environment runs from there only; for an image run the installer inside of it (chroot)",
+    )
     parser.add_argument("--uav", help=f"the aircraft's name, a part of every key (default {_UAV})")
     parser.add_argument(
         "--role",
