@@ -66,9 +66,11 @@ class Board:
     relocks: int = 0
     relocked_at_rad: float = 0.0
     homeward: bool = False
+    """No further tree: the way leads to the start."""
     giving_way: bool = False
     """Flies to its start to make room for others, and chooses on from there."""
-    """No further tree: the way leads to the start."""
+    over_start_s: float = 0.0
+    """For how long it has been at rest over the start, on its way back."""
     dock_direction: Matrix | None = None
     """Unit vector (2,) from the axis to the docking place."""
     dock_offset_m: float = 0.0
