@@ -33,7 +33,8 @@ _NOTED_M = 4.5
 """Surfaces farther away are too vague to be kept."""
 _BODY_M = 0.45
 _LEAST_HALF_M, _VIEW_SLOPE = 0.20, 0.6
-_LEAST_CELLS = 2
+_LEAST_CELLS, _SURE = 2, 9
+"""Cells that make a thing; a single one, as of a sapling or a post, must have been seen more often."""
 _SKIN_M = 0.08
 
 
@@ -155,7 +156,7 @@ class Space:
             if cell not in open_cells:
                 continue
             group = _connected(cell, open_cells)
-            if len(group) >= _LEAST_CELLS:
+            if len(group) >= _LEAST_CELLS or self._hits[group[0]] >= _SURE:
                 found.append(self._thing(np.array(group, dtype=float)))
         return found
 

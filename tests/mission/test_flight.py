@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from services.evaluate.bench_avoid import meeting
-from services.evaluate.flight import Flight, obstacle_case, random_case
+from services.evaluate.eyes import Round
+from services.evaluate.flight import Flight, FlightCase, obstacle_case, random_case, weather
+from services.evaluate.synthetic import TrueTrunk
 from services.navigator.autopilot.bridge import Bridge
 from services.navigator.config import NavigatorConfig
 from services.navigator.mission import Mission
@@ -142,6 +144,21 @@ def test_around_a_trunk_on_the_way() -> None:
     assert flight.run(("docked",)) == "docked", flight.mission.reason
     assert flight.touches == 0
     assert flight.clearance_m > flight.case.navigator.aircraft_radius_m + 0.1
+
+
+@pytest.mark.parametrize("seed", [0, 5])
+def test_round_a_post_as_thin_as_a_sapling(seed: int) -> None:
+    """It fills one cell of the grid and was forgotten once the camera had turned: touched on the way back, or never passed."""
+    rng = np.random.default_rng(seed)
+    share, aside = rng.uniform(0.35, 0.6), rng.uniform(-0.25, 0.25)
+    post = Round(-2.0 * share + 0.94 * aside, 5.5 * share + 0.34 * aside, 0.042)
+    trunk = TrueTrunk(-2.0, 5.5, 0.1)
+    home = NavigatorConfig(return_home=True)
+    flight = Flight(FlightCase(seed, (trunk,), things=(post,), wind=weather(rng), navigator=home))
+    flight.start()
+    assert flight.run() == "landed", flight.mission.reason
+    assert len(flight.dock_errors) == 1
+    assert flight.clearance_m > 0.35
 
 
 def test_three_trees_then_home() -> None:
