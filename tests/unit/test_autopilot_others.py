@@ -64,7 +64,13 @@ def test_another_who_falls_silent_in_time_is_forgiven() -> None:
     assert "holding" not in rig.bridge.state(rig.now_ns).note
 
 
-@pytest.mark.parametrize("other", [{"engage": False, "mission_id": 0}, {"engage": True, "mission_id": 9, "land": True}])
+_OTHERS: list[dict[str, Any]] = [
+    {"engage": False, "mission_id": 0}, {"engage": True, "mission_id": 9, "land": True},
+    {"engage": True, "mission_id": 1, "land": True, "seq": 3},  # it was started in flight, and adopts what it finds
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("other", _OTHERS)
 def test_a_second_navigator_neither_steers_nor_stops_the_mission_that_is_flown(other: dict[str, Any]) -> None:
     rig = Rig()
     rig.engage()
@@ -77,9 +83,38 @@ def test_a_second_navigator_neither_steers_nor_stops_the_mission_that_is_flown(o
         rig.guidance = own
         assert all(m.x == pytest.approx(0.5) for m in rig.setpoints(0.01))
     assert rig.bridge.engagement.of_others == 200
-    assert "stop one of them" in rig.bridge.engagement.others_word(rig.now_ns)
+    assert "stop it" in rig.bridge.engagement.others_word(rig.now_ns)
     rig.run(3.5)
     assert rig.bridge.engagement.others_word(rig.now_ns) == ""
+
+
+def test_another_mission_does_not_begin_while_the_flown_one_pauses() -> None:
+    rig = Rig()
+    rig.engage()
+    own, other = rig.guidance, {"engage": True, "mission_id": 9}
+    for ticks, guidance in ((60, other), (100, own)):
+        for _ in range(ticks):
+            rig.guidance = other
+            rig.bridge.on_guidance(rig.guidance_message(), rig.now_ns)
+            rig.guidance = own if guidance is own else None
+            rig.tick()
+        assert rig.bridge.engagement.mission_id == 1
+        assert ("holding" in rig.bridge.state(rig.now_ns).note) == (guidance is other)
+    assert rig.bridge.engagement.phase == "engaged"
+
+
+def test_one_that_adopted_the_mission_is_heard_once_the_first_is_silent() -> None:
+    rig = Rig()
+    rig.engage()
+    rig.guidance = None
+    rig.run(0.1)
+    again = {"engage": True, "mission_id": 1, "land": True}
+    for k in range(100):
+        rig.guidance = {**again, "seq": k + 1}
+        rig.bridge.on_guidance(rig.guidance_message(), rig.now_ns)
+        rig.guidance = None
+        rig.run(0.05)
+    assert rig.bridge.engagement.phase == "landing"
 
 
 def test_a_navigator_that_was_started_again_is_heard_once_the_old_one_is_silent() -> None:

@@ -20,6 +20,8 @@ _STREAMING: frozenset[Phase] = frozenset({"streaming", "switching", "arming", "e
 _REPEAT_S = 0.5
 _DISARM_AFTER_S = 4.0
 _OTHERS_TOLD_S = 3.0
+_SEQ_GAP = 100
+"""So many messages of one navigator may be lost in a row."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,10 +91,10 @@ class Engagement:
     def on_guidance(self, guidance: Guidance, vehicle: Vehicle, now_ns: int) -> None:
         """Take guidance. A new mission engages on the step from engage off to on, seen by us, vehicle disarmed.
 
-        While one mission is flown by fresh guidance, that of another is a second navigator's: counted, and left alone.
+        While a mission is flown, guidance of another is a second navigator's: counted, and left alone. So is that of the same
+        mission which does not continue what is followed: a navigator that starts in flight adopts what it finds.
         """
-        flown = self.phase not in ("quiet", "released") and self.usable(now_ns) is not None
-        if flown and guidance.mission_id != self.mission_id:
+        if self.phase not in ("quiet", "released") and self._of_another(guidance, now_ns):
             self.of_others += 1
             self._others_ns = now_ns
             return
@@ -109,11 +111,17 @@ class Engagement:
             why = "it was under way when the bridge was started" if not rising else "the vehicle is not free"
             self.note = f"mission {guidance.mission_id} is not engaged: {why}"
 
+    def _of_another(self, guidance: Guidance, now_ns: int) -> bool:
+        if guidance.mission_id != self.mission_id:
+            return True
+        followed = self.usable(now_ns)  # None once it is silent: who was started again is heard then
+        return followed is not None and not 0 < guidance.seq - followed.seq <= _SEQ_GAP
+
     def others_word(self, now_ns: int) -> str:
         """Return what is to be told of another navigator that spoke lately, empty when none did."""
         if self._others_ns is None or (now_ns - self._others_ns) / 1e9 > _OTHERS_TOLD_S:
             return ""
-        return "a second navigator speaks, of another mission than the one that is flown: stop one of them"
+        return "a second navigator speaks while the first one flies: stop it"
 
     def usable(self, now_ns: int) -> Guidance | None:
         """Return the guidance to follow, or None when the aircraft has to hold."""
