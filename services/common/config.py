@@ -67,13 +67,18 @@ class TreedockConfig(BaseModel):
         return name
 
     @model_validator(mode="after")
-    def _encrypted_or_plain(self) -> TreedockConfig:
-        """Certificates on a plain bus would guard nothing; an encrypted one without them admits nobody."""
+    def _agrees(self) -> TreedockConfig:
+        """Certificates on a plain bus would guard nothing; an encrypted one without them admits nobody; and so on."""
         encrypted = self.router.protocol != "tcp"
         if encrypted and self.security.folder is None:
             raise ValueError(f"router.protocol {self.router.protocol} needs security.folder (see `treedock certs`)")
         if self.security.folder is not None and not encrypted:
             raise ValueError("security.folder is set, but router.protocol is tcp: set it to tls, or to quic")
+        if not self.navigator.handheld and self.navigator.dock.min_m < self.camera.min_range_m:
+            raise ValueError(
+                f"navigator.dock.min_m {self.navigator.dock.min_m:g} is nearer than camera.min_range_m {self.camera.min_range_m:g}: the camera "
+                "sees no trunk there"
+            )
         if self.autopilot.vehicle == "real" and not encrypted and not self.router.local:
             raise ValueError(
                 "autopilot.vehicle is real, and anybody who reaches router.host or router.listen_host could fly it: certificates "

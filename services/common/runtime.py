@@ -106,7 +106,7 @@ def _serve(context: LiveContext, build: Build, stop: StopSignal) -> int:
     build(context)
     context.every_wall(_HEALTH_PERIOD_NS * 1e-9, report)
     if context.clock.simulated:
-        context.every(_HEALTH_PERIOD_NS * 1e-9, report_if_due)
+        context.every(0.25 * _HEALTH_PERIOD_NS * 1e-9, report_if_due)
     context.bus.declare_live(context.service)
     stop.when_set(context.inbox.wake)
     started()

@@ -13,13 +13,14 @@ from pydantic import BaseModel
 NOT_FLOWN = frozenset({"simulator", "station", "recorder", "preview", "fine", "clock_ahead_s"})
 """Sections that nobody flies by: there an hour may be a day."""
 _UNITS = {
-    "_rad": (50.0, "radians are meant, not degrees"),
-    "_rad_s": (50.0, "radians a second are meant, not degrees"),
-    "_m": (90.0, "metres are meant, not centimetres or millimetres"),
-    "_m_s": (90.0, "metres a second are meant, not centimetres or millimetres"),
-    "_s": (500.0, "seconds are meant, not milliseconds"),
+    "_rad": (50.0, 0.05, "radians", "degrees"),
+    "_m": (90.0, 0.1, "metres", "centimetres or millimetres"),
+    "_s": (500.0, 0.1, "seconds", "milliseconds"),
 }
-"""What a setting's name ends in: as many times the default as a slip of the unit makes at least (57, 100, 1000), less a little."""
+"""What a setting's name ends in: as many times the default as a slip of the unit makes at least (57, 100, 1000), less a little; the
+least default that says what is usual (a threshold of millimetres may well be chosen a hundred times as large); the unit; the slip."""
+_RATES = ("_per_m", "_per_s", "_inverse_m", "_px_s", "_m_s", "_rad_s")
+"""Ends of names that are no lengths or times."""
 
 
 def slip(defaults: BaseModel, config: BaseModel, key: str) -> str:
@@ -32,14 +33,16 @@ def slip(defaults: BaseModel, config: BaseModel, key: str) -> str:
         return "a number that is finite is expected"
     if not (unit and default and isinstance(value, int | float) and isinstance(default, int | float)):
         return ""
-    factor, meant = _UNITS[unit]
+    factor, least, meant, slipped = _UNITS[unit]
+    if abs(default) < least:
+        return ""
     if key.partition(".")[0] in NOT_FLOWN or _bounded(defaults, leaf) or abs(value) < factor * abs(default):
         return ""
-    return f"that is {abs(value / default):.0f} times the default {default:g}: {meant}"
+    return f"that is {abs(value / default):.0f} times the default {default:g}; {meant} are meant, not {slipped}"
 
 
 def _unit(name: str) -> str:
-    return next((unit for unit in sorted(_UNITS, key=len, reverse=True) if name.endswith(unit)), "")
+    return "" if name.endswith(_RATES) else next((unit for unit in _UNITS if name.endswith(unit)), "")
 
 
 def _bounded(tree: BaseModel, leaf: str) -> bool:

@@ -26,11 +26,11 @@ class DetectorConfig(BaseModel):
     min_radius_m: float = 0.02
     max_radius_m: float = 0.60
     """Trunks are looked for up to here; those above ``max_suitable_radius_m`` are listed as unsuitable."""
-    min_suitable_radius_m: float = 0.03
-    max_suitable_radius_m: float = 0.20
-    max_lean_rad: float = 0.50
+    min_suitable_radius_m: float = Field(default=0.03, ge=0.0, le=2.0)
+    max_suitable_radius_m: float = Field(default=0.20, gt=0.0, le=2.0)
+    max_lean_rad: float = Field(default=0.50, gt=0.0, le=1.6)
     """Steeper axes are not trunks (about 28 degrees: tolerance above the suitable 20)."""
-    max_suitable_lean_rad: float = 0.349066
+    max_suitable_lean_rad: float = Field(default=0.349066, gt=0.0, le=1.6)
     min_slice_points: int = 6
     min_layers: int = 5
     min_span_m: float = 0.6

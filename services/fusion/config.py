@@ -7,6 +7,7 @@ import math
 from pydantic import BaseModel, ConfigDict, Field
 
 from services.camera.config import CameraConfig
+from services.common.config_types import Near
 
 
 class ImuNoiseConfig(BaseModel):
@@ -30,7 +31,7 @@ class GpsConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    antenna_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    antenna_m: tuple[Near, Near, Near] = (0.0, 0.0, 0.0)
     """Antenna in body (forward, left, up)."""
     delay_s: float = Field(default=0.1, ge=0.0, le=1.0)
     """Age of a fix when the autopilot stamps it."""
@@ -66,11 +67,11 @@ class SecondCameraConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     enabled: bool = False
-    offset_m: tuple[float, float, float] = (0.0, 0.0, -0.05)
+    offset_m: tuple[Near, Near, Near] = (0.0, 0.0, -0.05)
     """Camera centre in body (forward, left, up)."""
-    pitch_rad: float = Field(default=math.pi / 2, ge=-math.pi / 2, le=math.pi / 2)
+    pitch_rad: float = Field(default=math.pi / 2, ge=-1.6, le=1.6)
     """Down is positive: pi/2 looks at the ground, -pi/2 into the crowns; the image's upper edge is then forward, or aft."""
-    yaw_rad: float = Field(default=0.0, ge=-math.pi, le=math.pi)
+    yaw_rad: float = Field(default=0.0, ge=-3.2, le=3.2)
     camera: CameraConfig = CameraConfig()
     """Its source and its depth's treatment, as of the first camera."""
 

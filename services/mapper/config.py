@@ -54,5 +54,5 @@ class MapperConfig(BaseModel):
     state_dir: str = "auto"
     """Folder in which the map survives a restart; ``off``; ``auto``: $STATE_DIRECTORY, else ~/.local/state/treedock/<uav>,
     and off where time is simulated."""
-    save_s: float = Field(default=10.0, gt=0.0)
+    save_s: float = Field(default=10.0, gt=0.0, le=1e6)
     """A changed map is written at most so often."""

@@ -35,31 +35,31 @@ class DockConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     aim_m: float = Field(default=0.95, gt=0.0, le=5.0)
-    min_m: float = Field(default=0.85, gt=0.0)
-    max_m: float = Field(default=1.00, gt=0.0)
-    margin_m: float = Field(default=0.02, ge=0.0)
+    min_m: float = Field(default=0.85, gt=0.0, le=5.0)
+    max_m: float = Field(default=1.00, gt=0.0, le=5.0)
+    margin_m: float = Field(default=0.02, ge=0.0, le=0.5)
     """The believed mean keeps this far inside both limits, so that the true one is inside too."""
-    prefer_m: float = Field(default=0.015, gt=0.0)
+    prefer_m: float = Field(default=0.015, gt=0.0, le=0.5)
     """For the first ``prefer_s`` in dock only a mean this near to the aim counts: patience buys accuracy."""
-    prefer_s: float = Field(default=12.0, ge=0.0)
-    bearing_rad: float = Field(default=math.radians(3.0), gt=0.0)
-    window_s: float = Field(default=3.0, gt=0.0)
-    still_m: float = Field(default=0.12, gt=0.0)
+    prefer_s: float = Field(default=12.0, ge=0.0, le=300.0)
+    bearing_rad: float = Field(default=math.radians(3.0), gt=0.0, le=0.5)
+    window_s: float = Field(default=3.0, gt=0.0, le=60.0)
+    still_m: float = Field(default=0.12, gt=0.0, le=1.0)
     """Not moving: how far the camera may wander within the window."""
-    drift_m_s: float = Field(default=0.05, gt=0.0)
+    drift_m_s: float = Field(default=0.05, gt=0.0, le=0.5)
     """Not moving: the slope of the camera's position over the window."""
-    enter_m: float = Field(default=1.15, gt=0.0)
+    enter_m: float = Field(default=1.15, gt=0.0, le=10.0)
     """Approach ends and dock begins at this distance."""
-    leave_m: float = Field(default=1.5, gt=0.0)
+    leave_m: float = Field(default=1.5, gt=0.0, le=10.0)
     """Dock falls back to approach beyond this distance."""
-    integral_per_s: float = Field(default=0.25, ge=0.0)
+    integral_per_s: float = Field(default=0.25, ge=0.0, le=10.0)
     """How fast a standing offset between setpoint and camera is learnt and taken out; 0 switches it off."""
-    integral_limit_m: float = Field(default=0.20, ge=0.0)
+    integral_limit_m: float = Field(default=0.20, ge=0.0, le=1.0)
     stiffness: float = Field(default=0.5, ge=0.0, le=1.0)
     """How much firmer than the autopilot alone the place is held: its own gain is 1. In gusts of 0.6 m/s the true
     place strays 0.11 m RMS with 0, 0.06 m with 0.5 and 0.05 m with 0.8, where less margin is left."""
-    timeout_s: float = Field(default=60.0, gt=0.0)
-    hold_s: float = Field(default=4.0, ge=0.0)
+    timeout_s: float = Field(default=60.0, gt=0.0, le=3600.0)
+    hold_s: float = Field(default=4.0, ge=0.0, le=3600.0)
     """Hover after docking before what follows."""
 
     @model_validator(mode="after")
@@ -109,7 +109,7 @@ class FailsafeConfig(BaseModel):
     obstacle_hold_s: float = Field(default=10.0, gt=0.0, le=300.0)
     restart_hold_s: float = Field(default=5.0, gt=0.0, le=60.0)
     operator_hold_s: float = Field(default=180.0, gt=0.0, le=3600.0)
-    clear_s: float = Field(default=1.0, ge=0.0)
+    clear_s: float = Field(default=1.0, ge=0.0, le=30.0)
     """A fault must be gone for this long before the mission goes on."""
 
 
@@ -129,46 +129,75 @@ class NavigatorConfig(BaseModel):
     return_home: bool = False
     """Fly back to the start before landing; always done after more than one tree."""
     rate_hz: float = Field(default=20.0, ge=5.0, le=100.0)
-    start_height_m: float = Field(default=0.1, ge=0.0)
+    start_height_m: float = Field(default=0.1, ge=0.0, le=3.0)
     """Camera above ground at the start (the map's origin)."""
     flight_height_m: float = Field(default=1.5, gt=0.0, le=50.0)
-    min_ground_m: float = Field(default=1.0, gt=0.0)
+    min_ground_m: float = Field(default=1.0, gt=0.0, le=20.0)
     """Least height over the ground at the target's foot: the aircraft rises on a slope."""
     climb_speed_m_s: float = Field(default=0.4, gt=0.0, le=2.0)
     scan_rate_rad_s: float = Field(default=math.radians(25.0), gt=0.0, le=math.pi)
-    scan_overlap_rad: float = Field(default=math.radians(20.0), ge=0.0)
-    scan_falter_inliers: int = Field(default=40, ge=0)
+    scan_overlap_rad: float = Field(default=math.radians(20.0), ge=0.0, le=3.2)
+    scan_falter_inliers: int = Field(default=40, ge=0, le=10000)
     """With fewer matched points than this slam falters: the scan turns back and comes again slowly."""
-    scan_turns_max: float = Field(default=2.2, ge=1.0)
+    scan_turns_max: float = Field(default=2.2, ge=1.0, le=20.0)
     turn_rate_rad_s: float = Field(default=math.radians(25.0), gt=0.0, le=math.pi)
     approach_speed_m_s: float = Field(default=0.35, gt=0.0, le=2.0)
-    approach_gain_per_s: float = Field(default=0.5, gt=0.0)
+    approach_gain_per_s: float = Field(default=0.5, gt=0.0, le=5.0)
     """Speed per metre still to go: the closer, the slower."""
-    visual_range_m: float = Field(default=4.0, gt=0.0)
+    visual_range_m: float = Field(default=4.0, gt=0.0, le=30.0)
     """Within this distance of the trunk the approach needs the target in sight; beyond it the map will do."""
-    select_settle_s: float = Field(default=2.0, ge=0.0)
-    select_wait_s: float = Field(default=15.0, gt=0.0)
+    select_settle_s: float = Field(default=2.0, ge=0.0, le=120.0)
+    select_wait_s: float = Field(default=15.0, gt=0.0, le=600.0)
     select_confidence: float = Field(default=0.3, ge=0.0, le=1.0)
-    face_wait_s: float = Field(default=10.0, gt=0.0)
-    target_timeout_s: float = Field(default=150.0, gt=0.0)
+    face_wait_s: float = Field(default=10.0, gt=0.0, le=600.0)
+    target_timeout_s: float = Field(default=150.0, gt=0.0, le=3600.0)
     """Longest time from choosing a tree to docking at it; in the approach, then the next tree is chosen."""
-    look_s: float = Field(default=3.0, gt=0.0)
+    look_s: float = Field(default=3.0, gt=0.0, le=120.0)
     """How long to look along a way that nobody has seen, before the tree is given up."""
-    undock_m: float = Field(default=1.8, gt=0.0)
+    undock_m: float = Field(default=1.8, gt=0.0, le=20.0)
     """Distance from the trunk's axis at which undocking ends."""
-    aircraft_radius_m: float = Field(default=0.35, gt=0.0)
-    safety_radius_m: float = Field(default=0.80, gt=0.0)
+    aircraft_radius_m: float = Field(default=0.35, gt=0.0, le=3.0)
+    safety_radius_m: float = Field(default=0.80, gt=0.0, le=5.0)
     live_guard: bool = True
     """Brake for whatever the depth image shows in the way, mapped or not, and fly only where somebody has looked."""
     frames: Literal["raw", "compressed"] = "raw"
     """Which of the camera's two keys the guard takes: ``compressed`` where the camera is on another machine."""
-    guard_height_m: float = Field(default=0.25, gt=0.0)
+    guard_height_m: float = Field(default=0.25, gt=0.0, le=2.0)
     """Half height of the aircraft with margin, for the live guard."""
-    preflight_wait_s: float = Field(default=60.0, gt=0.0)
+    preflight_wait_s: float = Field(default=60.0, gt=0.0, le=3600.0)
     """PX4 takes 5 to 20 s to use the vision pose, and longer when it is still starting."""
-    arm_wait_s: float = Field(default=40.0, gt=0.0)
+    arm_wait_s: float = Field(default=40.0, gt=0.0, le=600.0)
     """More than the bridge spends on mode and arming (autopilot.engage_timeout_s each): it knows the reason."""
-    takeoff_wait_s: float = Field(default=30.0, gt=0.0)
+    takeoff_wait_s: float = Field(default=30.0, gt=0.0, le=600.0)
     nonce_valid_s: float = Field(default=10.0, gt=0.0, le=60.0)
     ground_required: bool = False
     """Refuse to start without a ground station; a lost one is acted upon either way once it was there."""
+
+    @model_validator(mode="after")
+    def _fits(self) -> NavigatorConfig:
+        """Refuse what cannot be flown, or only into something."""
+        if self.aircraft_radius_m > self.safety_radius_m:
+            raise ValueError(
+                f"aircraft_radius_m {self.aircraft_radius_m:g} is larger than safety_radius_m {self.safety_radius_m:g}: ways are planned "
+                "with the latter"
+            )
+        nearest_m = self.aircraft_radius_m + _BARK_M
+        if self.dock.min_m < nearest_m:
+            raise ValueError(
+                f"dock.min_m {self.dock.min_m:g} is nearer to a trunk's axis than aircraft_radius_m {self.aircraft_radius_m:g} and the "
+                f"radius of a trunk ({_BARK_M:g}) allow: {nearest_m:g} at least"
+            )
+        if not self.handheld and self.flight_height_m >= self.motion.fence_height_m:
+            raise ValueError(
+                f"flight_height_m {self.flight_height_m:g} is not below motion.fence_height_m {self.motion.fence_height_m:g}: raise the fence"
+            )
+        if not self.handheld and self.start_height_m >= self.flight_height_m:
+            raise ValueError(
+                f"start_height_m {self.start_height_m:g} is not below flight_height_m {self.flight_height_m:g}: it is the camera's height "
+                "above the ground before take-off"
+            )
+        return self
+
+
+_BARK_M = 0.2
+"""The largest radius that is docked at, as detector.slicing.max_suitable_radius_m by default."""

@@ -53,7 +53,7 @@ class SlamConfig(BaseModel):
     """Live, keyframes are kept on disk as they are made; a slam that was killed goes on with its map."""
     map_folder: Path | None = None
     """Where; by default in the state directory of the service or of the user."""
-    map_max_age_s: float = Field(default=600.0, gt=0)
+    map_max_age_s: float = Field(default=600.0, gt=0, le=3e7)
     """A map whose slam lived longer ago than this is not taken up, nor one from before the machine's last start."""
     map_file_mb: float = Field(default=256.0, gt=1)
     """Limit of the file of keyframes (54 KB each)."""

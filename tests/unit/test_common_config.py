@@ -138,6 +138,16 @@ def test_a_rule_of_ours_names_the_file_and_speaks_plainly(tmp_path: Path, text: 
     ("slam.max_depth_m", "6000"),
     ("slam.max_depth_m", "nan"),
     ("fusion.jump_rad", "3"),  # degrees
+    ("fusion.second.offset_m", "[0, 0, -50]"),
+    ("refiner.filter.lost_after_s", "200"),
+    ("navigator.start_height_m", "8"),
+    ("navigator.min_ground_m", "80"),
+    ("navigator.dock.bearing_rad", "2"),
+    ("navigator.scan_overlap_rad", "15"),
+    ("detector.slicing.max_suitable_radius_m", "15"),
+    ("detector.slicing.max_suitable_lean_rad", "17"),
+    ("detector.slicing.max_suitable_radius_m", "-1"),
+    ("autopilot.poll_s", "2"),
     ("fusion.second.camera.stall_s", "1000"),
     ("supervisor.hung_after_s", "10000"),
     ("simulator.start_m", "[0.0, inf]"),
@@ -147,9 +157,32 @@ def test_a_limit_in_the_wrong_unit_is_refused_not_a_failsafe_less(tmp_path: Path
         load(flags=[f"{key}={value}"], environ={}, system_directory=tmp_path)
 
 
+@pytest.mark.parametrize(("flags", "words"), [
+    (["navigator.aircraft_radius_m=0.9"], "safety_radius_m"),
+    (["navigator.aircraft_radius_m=0.9", "navigator.safety_radius_m=1.3"], "1.1 at least"),
+    (["navigator.dock.min_m=0.2", "navigator.dock.aim_m=0.3", "navigator.dock.max_m=0.4"], "0.55 at least"),
+    (["camera.min_range_m=1.0"], "sees no trunk"),
+    (["navigator.flight_height_m=4"], "motion.fence_height_m"),
+    (["navigator.motion.fence_height_m=0.5"], "flight_height_m"),
+    (["navigator.start_height_m=1.7"], "before take-off"),
+])  # fmt: skip
+def test_what_would_be_flown_into_something_or_not_at_all_is_refused(
+    tmp_path: Path, flags: list[str], words: str
+) -> None:
+    with pytest.raises(InputError, match=words):
+        load(flags=flags, environ={}, system_directory=tmp_path)
+
+
+def test_in_the_hand_the_camera_starts_where_it_is_carried(tmp_path: Path) -> None:
+    flags = ["navigator.handheld=true", "navigator.start_height_m=1.7"]
+    assert load(flags=flags, environ={}, system_directory=tmp_path).config.navigator.start_height_m == 1.7
+
+
 @pytest.mark.parametrize(("key", "value"), [
     ("slam.map_max_age_s", "86400"), ("supervisor.mission_within_s", "7200"), ("simulator.flight.limit_s", "1e9"),
     ("autopilot.origin_alt_m", "1500"), ("navigator.dock.hold_s", "120"), ("slam.new_map_after_s", "0.5"),
+    ("slam.map_max_age_s", "604800"), ("mapper.save_s", "86400"), ("detector.publish_move_m", "0.2"), ("mapper.move_rad", "0.03"),
+    ("fusion.imu_noise.gyro_rad_s", "0.06"), ("mapper.range_noise_per_m", "0.2"), ("fusion.second.pitch_rad", "1.5708"),
 ])  # fmt: skip
 def test_a_bold_choice_is_no_slip(tmp_path: Path, key: str, value: str) -> None:
     assert load(flags=[f"{key}={value}"], environ={}, system_directory=tmp_path).origins[key]

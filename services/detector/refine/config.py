@@ -93,7 +93,7 @@ class FilterConfig(BaseModel):
     blind_factor: float = Field(default=15.0, ge=1.0)
     """So many times larger are the accelerations while the camera's motion is not known."""
     radius_rate_m_s: float = Field(default=0.002, gt=0.0)
-    lost_after_s: float = Field(default=0.5, gt=0.0)
+    lost_after_s: float = Field(default=0.5, gt=0.0, le=2.0)
     """Predictions are published as tracking for this long after the last measurement."""
     restart_after: int = Field(default=3, ge=1)
     """So many refused measurements in a row start the filters anew: then the filters are wrong, not they."""

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-_Near = Annotated[float, Field(ge=-5.0, le=5.0)]
-"""Of a small aircraft; millimetres are refused."""
+from services.common.config_types import Near
 
 
 class AutopilotConfig(BaseModel):
@@ -29,34 +28,34 @@ class AutopilotConfig(BaseModel):
     system_id: int = Field(default=1, ge=1, le=255)
     """Ours until the autopilot's first heartbeat; then the autopilot's own."""
     component_id: int = Field(default=191, ge=1, le=255)
-    camera_offset_m: tuple[_Near, _Near, _Near] = (0.0, 0.0, 0.0)
+    camera_offset_m: tuple[Near, Near, Near] = (0.0, 0.0, 0.0)
     """Camera centre in body (forward, left, up)."""
     camera_pitch_rad: float = Field(default=0.0, ge=-3.2, le=3.2)
     """Camera looking down is positive."""
     camera_yaw_rad: float = Field(default=0.0, ge=-3.2, le=3.2)
     origin_lat_deg: float = Field(default=-38.0, ge=-90.0, le=90.0)
     origin_lon_deg: float = Field(default=176.0, ge=-180.0, le=180.0)
-    origin_alt_m: float = 300.0
+    origin_alt_m: float = Field(default=300.0, ge=-500.0, le=9000.0)
     """A made-up place on earth for the local origin: with it PX4 offers Hold and Return, which ask for a global
     position; nothing of ours depends on it."""
-    poll_s: float = Field(default=0.01, gt=0.0)
+    poll_s: float = Field(default=0.01, gt=0.0, le=0.1)
     odometry_hz: float = Field(default=30.0, ge=10.0, le=100.0)
     setpoint_hz: float = Field(default=25.0, ge=10.0, le=100.0)
     state_hz: float = Field(default=20.0, ge=5.0, le=100.0)
     propagate_s: float = Field(default=0.30, ge=0.0, le=0.5)
     """Longest time for which a pose is carried on at constant velocity; then vision falls silent."""
     send_velocity: bool = False
-    position_sigma_m: float = Field(default=0.01, gt=0.0)
+    position_sigma_m: float = Field(default=0.01, gt=0.0, le=1.0)
     """Least standard deviations told with the vision pose."""
-    angle_sigma_rad: float = Field(default=0.005, gt=0.0)
+    angle_sigma_rad: float = Field(default=0.005, gt=0.0, le=0.5)
     setpoint_reach_m: float = Field(default=2.0, gt=0.5, le=20.0)
     """A setpoint farther than this from where the aircraft is belongs to no sane mission (its leash is 0.6 m): hold."""
     guidance_stale_s: float = Field(default=0.4, gt=0.0, le=5.0)
     guidance_land_s: float = Field(default=6.0, gt=0.0, le=60.0)
     """Without guidance for this long: land. Longer than a navigator takes to be started again."""
     link_lost_s: float = Field(default=1.0, gt=0.0, le=10.0)
-    stream_before_offboard_s: float = Field(default=1.5, gt=1.0)
-    engage_timeout_s: float = Field(default=12.0, gt=0.0)
+    stream_before_offboard_s: float = Field(default=1.5, gt=1.0, le=30.0)
+    engage_timeout_s: float = Field(default=12.0, gt=0.0, le=300.0)
     """Patience with each of vision, mode and arming, asked for again and again: PX4's checks pass late after its start."""
 
     @model_validator(mode="after")
