@@ -92,6 +92,15 @@ def test_two_missions_are_two_reports_and_a_broken_one_is_told_at_the_stop(tmp_p
     assert recorded(tmp_path / "none", (state("idle", "waiting"),)) == []
 
 
+def test_a_second_mission_that_is_cut_off_has_its_report_too(tmp_path: Path) -> None:
+    second = (state("preflight", "start was commanded again", 103.0), state("approach", "on its way to 9", 104.0))
+    _, path = recorded(tmp_path / "cut", (*MISSION, *second))
+    page = path.read_text()
+    assert "on its way to 9" in page
+    assert "0.95 m for 3 s" not in page, "the first mission has its own report"
+    assert len(recorded(tmp_path / "idle", (*MISSION, state("idle", "waiting", 103.0)))) == 1
+
+
 def test_reports_alone_need_no_recording(tmp_path: Path) -> None:
     (path,) = recorded(tmp_path, MISSION, mcap=False)
     assert "0.95 m for 3 s" in path.read_text()
