@@ -11,6 +11,8 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from schemas.navigation import MissionState
 from schemas.slam import Pose, Transform
@@ -218,3 +220,11 @@ def test_a_day_of_missions_takes_the_room_of_the_longest() -> None:
     tracemalloc.stop()
     assert len(chronicle.story().trajectory) == 2000
     assert held < 100e3
+
+
+@given(st.integers(0, 2**63 - 1), st.integers(0, 2**63 - 1))
+def test_whatever_decodes_is_heard(tree_id: int, stamp_ns: int) -> None:
+    body = {**example(Target).model_dump(), "tree_id": tree_id, "stamp_ns": stamp_ns}
+    chronicle = Chronicle("uav1")
+    chronicle.hear(Target.model_validate(body))
+    assert chronicle.story().seen["tree_id"].tolist() == [tree_id]
