@@ -89,8 +89,9 @@ class Chronicle:
             self._path.clear()
         if last is not None and (last.state, last.reason) == (state.state, state.reason):
             return False
-        if len(story.states) < _MOST_STATES:
-            story.states.append(state)
+        if len(story.states) >= _MOST_STATES:
+            story.states.pop()  # the newest takes its place: how a mission ended is known however much it told
+        story.states.append(state)
         return state.state in ENDS and (last is None or last.state not in ENDS)
 
     def story(self) -> Story:

@@ -183,6 +183,16 @@ def test_another_mission_begins_the_path_anew_and_an_hour_of_them_is_not_piled_u
     assert [T[0, 3] for _, T in chronicle.story().trajectory] == [7.0]
 
 
+def test_a_mission_of_too_many_states_still_ends_and_is_reported_once() -> None:
+    chronicle = Chronicle("uav1")
+    due = [chronicle.hear(state("scan", f"turn {k}", 0.1 * k)) for k in range(2_100)]
+    due += [chronicle.hear(state("landed", "down", 300.0)) for _ in range(3)]
+    assert [k for k, now in enumerate(due) if now] == [2_100]
+    states = chronicle.story().states
+    assert len(states) == 2_000
+    assert (states[0].reason, states[-1].state) == ("turn 0", "landed")
+
+
 def test_thinning_keeps_shape_and_ends() -> None:
     path = FlownPath()
     assert path.poses() == []
