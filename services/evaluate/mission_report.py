@@ -48,6 +48,7 @@ class Story:
 def mission_report(story: Story) -> bytes:
     """Return the page."""
     title = f"treedock: mission of {story.uav}"
+    begin_ns = story.states[0].stamp_ns if story.states else None
     body = [
         "<!doctype html>", '<html lang="en"><head><meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width">', f"<title>{html.escape(title)}</title>",
@@ -55,7 +56,7 @@ def mission_report(story: Story) -> bytes:
         "<h2>What happened</h2>", timeline_svg(story.states, story.seen), _events(story.states), *_choice(story),
         "<h2>Trees</h2>", tree_table(story.trees),
         "<h2>From above</h2>", top_view_svg(story.trees, story.trajectory, story.points_m),
-        *trunks_section(story.trees, story.points_m), *filters_section(story.seen), *_services(story.health),
+        *trunks_section(story.trees, story.points_m), *filters_section(story.seen, begin_ns), *_services(story.health),
         "</body></html>",
     ]  # fmt: skip
     return ("\n".join(body) + "\n").encode()

@@ -119,9 +119,9 @@ def trunks_section(trees: Sequence[Tree], points_m: NDArray[np.float32]) -> list
     return ["<h2>Trunks</h2>", f"<p>{words}{left_out}</p>", '<section class="trunks">', *pictures, "</section>"]
 
 
-def filters_section(seen: Sightings | None) -> list[str]:
-    """Return the filters' work over time, nothing when no target was tracked."""
-    plots = "" if seen is None else filter_plots_svg(seen)
+def filters_section(seen: Sightings | None, begin_ns: int | None = None) -> list[str]:
+    """Return the filters' work over time since ``begin_ns`` (else the first of ``seen``), nothing when no target was tracked."""
+    plots = "" if seen is None else filter_plots_svg(seen, begin_ns)
     return ["<h2>Target</h2>", plots] if plots else []
 
 

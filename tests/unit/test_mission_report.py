@@ -24,7 +24,8 @@ from services.common.geometry import pose as matrix
 from services.common.geometry import rotation_z
 from services.common.memory import Hub
 from services.evaluate.mission_report import Story, mission_report
-from services.evaluate.sightings import sightings
+from services.evaluate.sightings import SIGHTING, Sightings, sightings
+from services.evaluate.timeline import timeline_svg
 from services.recorder.chronicle import Chronicle
 from services.recorder.chronicle import Path as FlownPath
 from services.recorder.config import RecorderConfig
@@ -145,6 +146,45 @@ def test_the_page_says_how_it_ended_and_shows_it_over_time() -> None:
     assert row in page, "diameter and its sigma"
     failed = mission_report(Story(states=[*MISSION[:2], state("failed", "no tree was found", 9.0)])).decode()
     assert 'class="verdict warn"' in failed
+
+
+def tracked(count: int, hz: float, begin_s: float = 1.0, tree_id: int = 7) -> Sightings:
+    """Return what was seen of one tree at a steady rate."""
+    seen = np.zeros(count, SIGHTING)
+    seen["stamp_ns"] = np.round((begin_s + np.arange(count) / hz) * SECOND)
+    seen["tree_id"], seen["tracking"], seen["range_m"] = tree_id, True, 1.5 + np.sin(np.arange(count) / 50)
+    return seen
+
+
+def flown(seconds: float) -> list[MissionState]:
+    return [MISSION[0].model_copy(update={"stamp_ns": round(s * SECOND)}) for s in (0.0, seconds)]
+
+
+def distance_line(svg: str) -> list[tuple[str, float, float]]:
+    (line,) = (p.attrib["d"] for p in ET.fromstring(svg).iter("path"))
+    return [(a, float(x), float(y)) for a, x, y in re.findall(r"([ML])([\d.]+) ([\d.]+)", line)]
+
+
+@given(st.integers(2, 20_000), st.floats(0.2, 30.0))
+def test_the_distance_is_one_line_however_long_the_flight(count: int, hz: float) -> None:
+    points = distance_line(timeline_svg(flown(2.0 + count / hz), tracked(count, hz)))
+    assert [a for a, _, _ in points].count("M") == 1
+    assert min(count, 1_400) <= len(points) <= 3_100
+    end_px = 62 + (720 - 68) * (1.0 + (count - 1) / hz) / (2.0 + count / hz)
+    assert points[-1][1] == pytest.approx(end_px, abs=0.1), "the end is there"
+
+
+def test_the_distance_breaks_where_another_tree_is_tracked_or_none_for_a_while() -> None:
+    parts = [tracked(9_000, 15.0), tracked(3_000, 15.0, 601.0, 8), tracked(3_000, 15.0, 802.0, 8)]
+    points = distance_line(timeline_svg(flown(1100.0), np.concatenate(parts)))
+    begun_px = [x for a, x, _ in points if a == "M"]
+    assert begun_px == pytest.approx([62 + (720 - 68) * s / 1100.0 for s in (1.0, 601.0, 802.0)], abs=0.1)
+
+
+def test_both_plots_of_a_mission_count_from_its_begin() -> None:
+    seen = tracked(300, 15.0, 21.0)
+    page = mission_report(Story(uav="uav1", states=list(MISSION), seen=seen)).decode()
+    assert "20.0 to 39.9 s" in page, "the mission began at 1 s"
 
 
 def test_a_submap_that_the_graph_moved_keeps_its_points() -> None:
