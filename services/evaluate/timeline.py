@@ -22,7 +22,7 @@ _COLOURS = {
 _OTHER = "#e5e7eb"
 _DOCK_M = (0.85, 1.00)
 """Where a mission is docked: camera to trunk axis."""
-_LETTER_PX = 6.8
+_LETTER_PX, _LINE_PX = 6.8, 13.0
 
 
 def timeline_svg(states: Sequence[MissionState], seen: Sightings | None = None) -> str:
@@ -85,10 +85,14 @@ def _distances(
     points = zip(begun[drawn], x[drawn].tolist(), ranges_m[drawn].tolist(), strict=True)
     path = [f"{'M' if new else 'L'}{a:.1f} {y(metres):.1f}" for new, a, metres in points]
     wide = _WIDTH_PX - _LEFT_PX - 6.0
+    labels: list[float] = []
+    for metres in (_DOCK_M[1], high, low, _DOCK_M[0]):  # those that matter first; none upon another
+        if all(abs(y(metres) - y(other)) >= _LINE_PX for other in labels):
+            labels.append(metres)
     return [
         f'<rect x="{_LEFT_PX:.0f}" y="{y(_DOCK_M[1]):.1f}" width="{wide:.0f}" height="{y(_DOCK_M[0]) - y(_DOCK_M[1]):.1f}" fill="{_BAND}"/>',
         f'<rect x="{_LEFT_PX:.0f}" y="{top:.0f}" width="{wide:.0f}" height="{_PLOT_PX:.0f}" fill="none" stroke="#d5ddd6"/>',
-        *(f'<text x="{_LEFT_PX - 6:.0f}" y="{y(m) + 4:.1f}" text-anchor="end" fill="{_FAINT}">{m:.2f} m</text>' for m in (high, *_DOCK_M, low)),
-        f'<text x="{_LEFT_PX:.0f}" y="{top - 5:.0f}" font-weight="600">distance to the tree, green where it is docked</text>',
+        *(f'<text x="{_LEFT_PX - 6:.0f}" y="{y(m) + 4:.1f}" text-anchor="end" fill="{_FAINT}">{m:.2f} m</text>' for m in labels),
+        f'<text x="{_LEFT_PX:.0f}" y="{top - 5:.0f}" font-weight="600">distance to the tree, green where it is docked ({_DOCK_M[0]:.2f} to {_DOCK_M[1]:.2f} m)</text>',
         f'<path d="{"".join(path)}" fill="none" stroke="{_LINE}" stroke-width="1.8"/>',
     ]  # fmt: skip

@@ -181,6 +181,25 @@ def test_the_distance_breaks_where_another_tree_is_tracked_or_none_for_a_while()
     assert begun_px == pytest.approx([62 + (720 - 68) * s / 1100.0 for s in (1.0, 601.0, 802.0)], abs=0.1)
 
 
+@given(st.floats(0.3, 30.0), st.floats(0.0, 30.0))
+def test_the_labels_of_the_distance_do_not_lie_on_each_other(near_m: float, more_m: float) -> None:
+    seen = tracked(50, 15.0)
+    seen["range_m"] = np.linspace(near_m, near_m + more_m, 50)
+    svg = timeline_svg(flown(5.0), seen)
+    labels = [(float(t.attrib["y"]), t.text) for t in ET.fromstring(svg).iter("text") if (t.text or "").endswith(" m")]
+    assert np.diff(sorted(y for y, _ in labels)).min(initial=99.0) >= 12.0
+    assert "1.00 m" in [text for _, text in labels], "the band is what matters"
+    assert "0.85 to 1.00 m" in svg
+
+
+def test_one_tree_is_one_tree() -> None:
+    trees = example(TreeList).trees[:1]
+    page = mission_report(Story(uav="uav1", states=list(MISSION), trees=trees)).decode()
+    assert "<small>docked</small><b>1</b><small>tree</small>" in page
+    assert "<small>tree</small><b>1</b>" in page
+    assert "<small>docked</small><b>0</b><small>trees</small>" in mission_report(Story()).decode()
+
+
 def test_both_plots_of_a_mission_count_from_its_begin() -> None:
     seen = tracked(300, 15.0, 21.0)
     page = mission_report(Story(uav="uav1", states=list(MISSION), seen=seen)).decode()
