@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from schemas.envelope import Counter, Message, Name, Text
+from schemas.envelope import Counter, Message, Name, Text, TreeId
 from schemas.orders import CommandName
 
 Nonce = Annotated[bytes, Field(min_length=16, max_length=16)]
@@ -39,7 +39,7 @@ class Command(Message):
     sender: Name
     nonce: Nonce
     sequence: Counter
-    tree_id: Annotated[int, Field(ge=0)] | None = None
+    tree_id: TreeId | None = None
     """For ``choose`` only."""
 
 

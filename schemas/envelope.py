@@ -19,6 +19,8 @@ Label = Annotated[str, Field(min_length=1, max_length=96, pattern=r"^[A-Za-z0-9_
 StampNs = Annotated[int, Field(ge=0, lt=2**63)]
 """Integer nanoseconds since the Unix epoch (or since the start of simulated time)."""
 Counter = Annotated[int, Field(ge=0, lt=2**63)]
+TreeId = Annotated[int, Field(ge=0, lt=2**63)]
+"""A tree's number in one map; it fits the 64 bits of the arrays and databases that keep it."""
 
 
 class DecodeError(ValueError):

@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from schemas.envelope import Counter, Message, Name, Part, StampNs, Text
+from schemas.envelope import Counter, Message, Name, Part, StampNs, Text, TreeId
 
 Vec2 = tuple[float, float]
 ClaimKind = Literal["claim", "renew", "release", "done"]
@@ -29,7 +29,7 @@ class ClaimGoal(Part):
     """Of the trunk."""
     sigma_m: Annotated[float, Field(ge=0.0)] = 0.0
     """Standard deviation of ``to_m`` in the map."""
-    tree_id: Annotated[int, Field(ge=0)] | None = None
+    tree_id: TreeId | None = None
     """In the aircraft's own list: for people to read."""
 
 

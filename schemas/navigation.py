@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from schemas.envelope import Counter, Message, Name, Part, StampNs, Text, Vec3
+from schemas.envelope import Counter, Message, Name, Part, StampNs, Text, TreeId, Vec3
 
 GuidanceCommand = Literal["take_off", "landing", "turn_left", "turn_right", "toward", "backward", "stop", "docked"]
 """The reference's eight commands."""
@@ -64,8 +64,8 @@ class MissionState(Message):
     since_ns: StampNs
     reason: Text
     """Why this state was entered, in words for the operator."""
-    target_tree_id: Annotated[int, Field(ge=0)] | None
-    visited_tree_ids: Annotated[tuple[int, ...], Field(max_length=1_000)]
+    target_tree_id: TreeId | None
+    visited_tree_ids: Annotated[tuple[TreeId, ...], Field(max_length=1_000)]
     docked_count: Counter
     distance_m: Annotated[float, Field(ge=0.0)] | None
     """Believed horizontal distance from the camera to the target's axis."""

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
-from schemas.envelope import Counter, Message, Name, Part, StampNs, Text, Vec3
+from schemas.envelope import Counter, Message, Name, Part, StampNs, Text, TreeId, Vec3
 
 NonNegative = Annotated[float, Field(ge=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -20,7 +20,7 @@ MAX_SUITABLE_LEAN_RAD = math.radians(20.0)
 class Tree(Part):
     """One trunk. ``x_m, y_m, z_m`` is where its axis meets the local ground."""
 
-    id: Annotated[int, Field(ge=0)]
+    id: TreeId
     x_m: float
     y_m: float
     z_m: float
@@ -70,7 +70,7 @@ class Target(Message):
     map_id: Name
     status: Literal["none", "tracking", "lost"]
     """none: no tree is expected in view; tracking: measured or predicted for a few frames; lost: expected, not seen."""
-    tree_id: Annotated[int, Field(ge=0)] | None
+    tree_id: TreeId | None
     measured: bool
     """True when this very frame showed the trunk, false when the values below are predictions."""
     bearing_rad: float | None

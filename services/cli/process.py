@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from services.cli.options import AsJson, ConfigFile, Settings, loaded
+from services.common.words import plural
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -98,6 +99,6 @@ def _summary(values: dict[str, Any], out: Path) -> str:
     frame_ms = values["ms"]["frame"]["median"]
     finer = f", {values['fine']['stems']} stems measured" if "fine" in values else ""
     return (
-        f"{values['frames']} frames{left_out}, {values['tracked_final']} tracked, {values['trees']} trees "
+        f"{values['frames']} {plural(values['frames'], 'frame')}{left_out}, {values['tracked_final']} tracked, {values['trees']} {plural(values['trees'], 'tree')} "
         f"({values['trees_suitable']} suitable){finer}, {frame_ms:.0f} ms a frame, {values['peak_memory_mb']:.0f} MB: {out}"
     )

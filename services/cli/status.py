@@ -13,6 +13,7 @@ from rich.text import Text
 
 from services.cli.supervisor import Child, Supervisor
 from services.cli.watch import Watch
+from services.common.words import plural
 
 _LINE_PERIOD_S = 3.0
 
@@ -50,7 +51,7 @@ def headline(watch: Watch, supervisor: Supervisor, expected: int | None = None) 
     parts = [
         stage(watch, supervisor),
         f"frame {watch.frames}" + (f" of {expected}" if expected else ""),
-        f"{len(trees)} trees ({suitable} suitable)",
+        f"{len(trees)} {plural(len(trees), 'tree')} ({suitable} suitable)",
     ]
     if watch.word:
         parts.insert(1, watch.word)

@@ -12,6 +12,7 @@ from schemas.simulation import SimTruth, TrueTree
 from schemas.trees import Tree, TreeList
 from services.cli.supervisor import Supervisor
 from services.cli.watch import Watch
+from services.common.words import plural
 
 _SAME_TREE_M = 0.5
 
@@ -94,7 +95,8 @@ def _beside(tree: Tree, true: TrueTree | None) -> tuple[str, ...]:
 def closing_line(values: dict[str, Any]) -> str:
     """Return the last line of a run."""
     suitable = sum(tree["suitable"] for tree in values["trees"])
-    line = f"{len(values['trees'])} trees found, {suitable} suitable"
+    count = len(values["trees"])
+    line = f"{count} {plural(count, 'tree')} found, {suitable} suitable"
     if "truth" in values:
         truth = values["truth"]
         line += f"; of {truth['suitable']} true suitable ones {truth['found']} found, {truth['false']} false"

@@ -18,6 +18,7 @@ from schemas.health import Health
 from schemas.navigation import MissionState
 from schemas.trees import Tree
 from services.common.geometry import Matrix
+from services.common.words import plural
 from services.evaluate.exports import Stamped
 from services.evaluate.report import STYLE, filters_section, table, tree_table, trunks_section
 from services.evaluate.sightings import Sightings, sightings
@@ -48,6 +49,7 @@ class Story:
 def mission_report(story: Story) -> bytes:
     """Return the page."""
     title = f"treedock: mission of {story.uav}"
+    begin_ns = story.states[0].stamp_ns if story.states else None
     body = [
         "<!doctype html>", '<html lang="en"><head><meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width">', f"<title>{html.escape(title)}</title>",
@@ -55,7 +57,7 @@ def mission_report(story: Story) -> bytes:
         "<h2>What happened</h2>", timeline_svg(story.states, story.seen), _events(story.states), *_choice(story),
         "<h2>Trees</h2>", tree_table(story.trees),
         "<h2>From above</h2>", top_view_svg(story.trees, story.trajectory, story.points_m),
-        *trunks_section(story.trees, story.points_m), *filters_section(story.seen), *_services(story.health),
+        *trunks_section(story.trees, story.points_m), *filters_section(story.seen, begin_ns), *_services(story.health),
         "</body></html>",
     ]  # fmt: skip
     return ("\n".join(body) + "\n").encode()
@@ -67,8 +69,7 @@ def _verdict(story: Story) -> str:
         return '<p class="verdict">No mission was heard of.</p>'
     last = story.states[-1]
     good = last.state == "landed" and last.docked_count > 0
-    count = f"{last.docked_count} tree{'' if last.docked_count == 1 else 's'}"
-    words = f"Docked at {count}. Ended {last.state.replace('_', ' ')}: {last.reason}."
+    words = f"Docked at {last.docked_count} {plural(last.docked_count, 'tree')}. Ended {last.state.replace('_', ' ')}: {last.reason}."
     begun_s = 1e-9 * story.states[0].stamp_ns
     if begun_s > _SIMULATED_BEFORE_S:
         words += f" Begun {dt.datetime.fromtimestamp(begun_s, dt.UTC):%Y-%m-%d %H:%M:%S} UTC."
@@ -83,12 +84,12 @@ def _cards(story: Story) -> str:
     seconds = 1e-9 * (story.states[-1].stamp_ns - story.states[0].stamp_ns) if story.states else 0.0
     holds = sum(state.state == "hold" for state in story.states)
     cards = (
-        ("docked", f"{docked}", "trees"),
+        ("docked", f"{docked}", plural(docked, "tree")),
         ("ended", last.state.replace("_", " ") if last else "-", (last.reason if last else "")[:60]),
-        ("trees", f"{len(story.trees)}", f"{sum(t.suitable for t in story.trees)} suitable"),
+        (plural(len(story.trees), "tree"), f"{len(story.trees)}", f"{sum(t.suitable for t in story.trees)} suitable"),
         ("time", f"{seconds:.0f} s", "from the first word to the last"),
         ("way", f"{length_m:.1f} m", "of the camera"),
-        ("holds", f"{holds}", "failsafes below" if holds else "no failsafe held it"),
+        (plural(holds, "hold"), f"{holds}", "failsafes below" if holds else "no failsafe held it"),
     )
     lines = [
         f"<div><small>{html.escape(a)}</small><b>{html.escape(b)}</b><small>{html.escape(c)}</small></div>"

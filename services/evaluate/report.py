@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.trees import Tree
+from services.common.words import plural
 from services.evaluate.exports import Stamped, tree_rows
 from services.evaluate.report_pictures import cross_section_svg, filter_plots_svg
 from services.evaluate.sightings import Sightings
@@ -27,7 +28,7 @@ _FILES = (
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 60rem; padding: 0 1rem; color: #1d2a20; }
 h1, h2 { font-weight: 600; } table { border-collapse: collapse; margin: 0.5rem 0 1.5rem; }
-th, td { padding: 0.2rem 0.7rem; text-align: right; border-bottom: 1px solid #d5ddd6; font-variant-numeric: tabular-nums; }
+th, td { padding: 0.2rem 0.5rem; text-align: right; border-bottom: 1px solid #d5ddd6; font-variant-numeric: tabular-nums; }
 th:first-child, td:first-child, .left2 th:nth-child(-n+3), .left2 td:nth-child(-n+3), .left5 th, .left5 td { text-align: left; }
 svg { width: 100%; height: auto; background: #f6f8f5; border: 1px solid #d5ddd6; }
 .warn { color: #9a3412; } .wide { overflow-x: auto; } th { white-space: nowrap; } p { max-width: 46rem; }
@@ -76,10 +77,10 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]], left: int = 1) -> 
 def _summary(values: Mapping[str, Any]) -> str:
     share = 100.0 * values["tracked_final"] / max(values["frames"], 1)
     cards = [
-        ("trees", f"{values['trees']}", f"{values['trees_suitable']} suitable"),
-        ("frames", f"{values['frames']}", f"{values['bad_frames']} left out"),
-        ("tracked", f"{share:.1f} %", f"{values['tracked_final']} frames"),
-        ("map", f"{values['cloud_points']:,}".replace(",", "\u202f"), "points"),
+        (plural(values["trees"], "tree"), f"{values['trees']}", f"{values['trees_suitable']} suitable"),
+        (plural(values["frames"], "frame"), f"{values['frames']}", f"{values['bad_frames']} left out"),
+        ("tracked", f"{share:.1f} %", f"{values['tracked_final']} {plural(values['tracked_final'], 'frame')}"),
+        ("map", f"{values['cloud_points']:,}".replace(",", "\u202f"), plural(values["cloud_points"], "point")),
         ("time", f"{values['duration_s']:.1f} s", f"{values['ms']['frame']['median']:.0f} ms a frame"),
         ("memory", f"{values['peak_memory_mb']:.0f} MB", "at its peak"),
     ]
@@ -94,7 +95,7 @@ def tree_table(trees: Sequence[Tree]) -> str:
     """Return the trees as a table."""
     if not trees:
         return "<p>No trees were found.</p>"
-    head = ("tree", "x m", "y m", "± cm", "ground m", "diameter cm", "± cm", "at m", "seen m", "lean °", "arc °", "confidence", "suitable")  # fmt: skip
+    head = ("tree", "x m", "y m", "± cm", "z m", "diameter cm", "± cm", "at m", "seen m", "lean °", "arc °", "conf.", "suitable")  # fmt: skip
     rows = []
     for row in tree_rows(trees):
         lean_deg = np.degrees(np.arccos(np.clip(row["axis"][2], -1.0, 1.0)))
@@ -104,7 +105,7 @@ def tree_table(trees: Sequence[Tree]) -> str:
             f"{lean_deg:.1f}", f"{np.degrees(row['arc_rad']):.0f}", f"{row['confidence']:.2f}",
             "yes" if row["suitable"] else "no",
         ))  # fmt: skip
-    words = "Diameters and their standard deviations at the height named; x ahead and y left of the start, ground is z where the trunk meets it."
+    words = "Diameters and their standard deviations at the height named; x ahead and y left of the start, z the ground where the trunk meets it."
     return f"<p>{words}</p>\n" + table(head, rows)
 
 
@@ -119,9 +120,9 @@ def trunks_section(trees: Sequence[Tree], points_m: NDArray[np.float32]) -> list
     return ["<h2>Trunks</h2>", f"<p>{words}{left_out}</p>", '<section class="trunks">', *pictures, "</section>"]
 
 
-def filters_section(seen: Sightings | None) -> list[str]:
-    """Return the filters' work over time, nothing when no target was tracked."""
-    plots = "" if seen is None else filter_plots_svg(seen)
+def filters_section(seen: Sightings | None, begin_ns: int | None = None) -> list[str]:
+    """Return the filters' work over time since ``begin_ns`` (else the first of ``seen``), nothing when no target was tracked."""
+    plots = "" if seen is None else filter_plots_svg(seen, begin_ns)
     return ["<h2>Target</h2>", plots] if plots else []
 
 

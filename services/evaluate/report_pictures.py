@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from schemas.trees import Tree
-from services.evaluate.sightings import Sightings
+from services.evaluate.sightings import Sightings, begins
 
 _SLICE_HALF_M = 0.10
 """Half the height of the slice that a cross-section shows."""
@@ -17,7 +17,6 @@ _MAX_POINTS = 500
 _SIDE_PX = 190.0
 _PLOT_PX, _PLOT_HEIGHT_PX, _LEFT_PX = 720.0, 130.0, 62.0
 _INK, _FAINT, _FIT, _RAW = "#1d2a20", "#5c6b60", "#15803d", "#9aa69d"
-_GAP_S = 0.5
 
 
 def cross_section_svg(tree: Tree, points_m: NDArray[np.float32], mark: str = "c") -> str:
@@ -60,14 +59,16 @@ def _slice(points_m: NDArray[np.float32], centre: NDArray[np.float64], half_m: f
     return found[:: max(1, len(found) // _MAX_POINTS)]
 
 
-def filter_plots_svg(seen: Sightings) -> str:
-    """Return the three filtered quantities over time: raw as dots, filtered as a line; empty when nothing was tracked."""
+def filter_plots_svg(seen: Sightings, begin_ns: int | None = None) -> str:
+    """Return the three filtered quantities over time: raw as dots, filtered as a line; empty when nothing was tracked.
+
+    Seconds count from ``begin_ns``, else from the first of ``seen``.
+    """
     tracked = seen[seen["tracking"]]
     if len(tracked) < 2:
         return ""
-    seconds = 1e-9 * (tracked["stamp_ns"] - seen["stamp_ns"][0])
-    other = np.diff(tracked["tree_id"], prepend=tracked["tree_id"][0]) != 0
-    breaks = other | np.concatenate([[True], np.diff(seconds) > _GAP_S])
+    seconds = 1e-9 * (tracked["stamp_ns"] - (seen["stamp_ns"][0] if begin_ns is None else begin_ns))
+    breaks = begins(seen, seen["tracking"])
     rows = [
         ("x in the image (px)", 1.0, "image_x_px"),
         ("range (m)", 1.0, "range_m"),
@@ -129,8 +130,8 @@ def _line(x: NDArray[np.float64], y: NDArray[np.float64], breaks: NDArray[np.boo
     """Return the path's data, broken where another tree was tracked, or none for a while."""
     parts = []
     broken = True
-    for a, b, begins in zip(x, y, breaks, strict=True):
-        broken = broken or bool(begins)
+    for a, b, new in zip(x, y, breaks, strict=True):
+        broken = broken or bool(new)
         if np.isfinite(b):
             parts.append(f"{'M' if broken else 'L'}{a:.1f} {b:.1f}")
         broken = not np.isfinite(b)

@@ -16,6 +16,7 @@ SIGHTING = np.dtype([
 ])  # fmt: skip
 """NaN and -1 stand for what the message leaves open."""
 Sightings = NDArray[np.void]
+_GAP_S, _GAP_FRAMES = 0.5, 3.0
 _VALUES = SIGHTING.names[3:] if SIGHTING.names else ()
 
 
@@ -31,3 +32,14 @@ def sighting(target: Target) -> tuple[int | bool | float, ...]:
 def sightings(targets: Sequence[Target] = ()) -> Sightings:
     """Return the messages' rows, (N,) of ``SIGHTING``."""
     return np.array([sighting(target) for target in targets], SIGHTING)
+
+
+def begins(seen: Sightings, shown: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return for each of the ``shown`` rows whether a line begins anew with it: another tree, or none for a while.
+
+    How long a while is follows from how often anything was ``seen``: a long flight's rows are thinned.
+    """
+    often_s = 1e-9 * float(np.median(np.diff(seen["stamp_ns"]))) if len(seen) > 1 else 0.0
+    rows = seen[shown]
+    late = np.diff(rows["stamp_ns"]) > 1e9 * max(_GAP_S, _GAP_FRAMES * often_s)
+    return np.concatenate([np.ones(min(len(rows), 1), np.bool_), late | (np.diff(rows["tree_id"]) != 0)])

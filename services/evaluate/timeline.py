@@ -7,9 +7,10 @@ import itertools
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.navigation import MissionState
-from services.evaluate.sightings import Sightings, sightings
+from services.evaluate.sightings import Sightings, begins, sightings
 
 _WIDTH_PX, _BAR_PX, _PLOT_PX, _LEFT_PX = 720.0, 34.0, 130.0, 62.0
 _INK, _FAINT, _LINE, _BAND = "#1d2a20", "#5c6b60", "#15803d", "#bbf7d0"
@@ -21,8 +22,7 @@ _COLOURS = {
 _OTHER = "#e5e7eb"
 _DOCK_M = (0.85, 1.00)
 """Where a mission is docked: camera to trunk axis."""
-_LETTER_PX = 6.8
-_GAP_S = 0.5
+_LETTER_PX, _LINE_PX = 6.8, 13.0
 
 
 def timeline_svg(states: Sequence[MissionState], seen: Sightings | None = None) -> str:
@@ -35,8 +35,8 @@ def timeline_svg(states: Sequence[MissionState], seen: Sightings | None = None) 
     shown = (
         seen["tracking"] & np.isfinite(seen["range_m"]) & (begin_ns <= seen["stamp_ns"]) & (seen["stamp_ns"] <= end_ns)
     )
-    ranges = list(zip(seen["stamp_ns"][shown].tolist(), seen["range_m"][shown].tolist(), strict=True))
-    height = 20.0 + _BAR_PX + (18.0 + _PLOT_PX if len(ranges) > 1 else 0.0) + 22.0
+    plotted = np.count_nonzero(shown) > 1
+    height = 20.0 + _BAR_PX + (18.0 + _PLOT_PX if plotted else 0.0) + 22.0
     parts = [
         f'<svg viewBox="0 0 {_WIDTH_PX:.0f} {height:.0f}" role="img" aria-label="states over time" font-size="12">'
     ]
@@ -50,8 +50,9 @@ def timeline_svg(states: Sequence[MissionState], seen: Sightings | None = None) 
         if wide > _LETTER_PX * len(word) + 6.0:
             parts.append(f'<text x="{x + 5:.1f}" y="{24 + _BAR_PX / 2:.0f}" fill="{_INK}">{html.escape(word)}</text>')
     parts += _seconds(1e-9 * (end_ns - begin_ns), 1e9 * scale, height)
-    if len(ranges) > 1:
-        parts += _distances(ranges, begin_ns, scale, 20.0 + _BAR_PX + 18.0)
+    if plotted:
+        x = _LEFT_PX + scale * (seen["stamp_ns"][shown] - begin_ns)
+        parts += _distances(x, seen["range_m"][shown], begins(seen, shown), 20.0 + _BAR_PX + 18.0)
     return "\n".join([*parts, "</svg>"])
 
 
@@ -68,25 +69,30 @@ def _seconds(span_s: float, px_per_s: float, height: float) -> list[str]:
     return parts
 
 
-def _distances(ranges: Sequence[tuple[int, float]], begin_ns: int, scale: float, top: float) -> list[str]:
-    """Return the distance to the tree over time, with the band in which it is docked."""
-    high = max(1.3, float(np.percentile([r for _, r in ranges], 99.0)) * 1.05)
-    low = min(0.7, min(r for _, r in ranges))
+def _distances(
+    x: NDArray[np.float64], ranges_m: NDArray[np.float64], begun: NDArray[np.bool_], top: float
+) -> list[str]:
+    """Return the distance to the tree over time, with the band in which it is docked; the line begins anew at ``begun``."""
+    high = max(1.3, float(np.percentile(ranges_m, 99.0)) * 1.05)
+    low = min(0.7, float(ranges_m.min()))
 
     def y(metres: float) -> float:
         return top + (high - min(high, metres)) / (high - low) * _PLOT_PX
 
-    path, last_ns = [], -(10**18)
-    for stamp_ns, metres in ranges[:: max(1, len(ranges) // 1500)]:
-        path.append(
-            f"{'M' if stamp_ns - last_ns > _GAP_S * 1e9 else 'L'}{_LEFT_PX + scale * (stamp_ns - begin_ns):.1f} {y(metres):.1f}"
-        )
-        last_ns = stamp_ns
+    # the ends of each piece stay when the rest is thinned
+    drawn = begun | np.append(begun[1:], True)
+    drawn[:: max(1, len(x) // 1500)] = True
+    points = zip(begun[drawn], x[drawn].tolist(), ranges_m[drawn].tolist(), strict=True)
+    path = [f"{'M' if new else 'L'}{a:.1f} {y(metres):.1f}" for new, a, metres in points]
     wide = _WIDTH_PX - _LEFT_PX - 6.0
+    labels: list[float] = []
+    for metres in (_DOCK_M[1], high, low, _DOCK_M[0]):  # those that matter first; none upon another
+        if all(abs(y(metres) - y(other)) >= _LINE_PX for other in labels):
+            labels.append(metres)
     return [
         f'<rect x="{_LEFT_PX:.0f}" y="{y(_DOCK_M[1]):.1f}" width="{wide:.0f}" height="{y(_DOCK_M[0]) - y(_DOCK_M[1]):.1f}" fill="{_BAND}"/>',
         f'<rect x="{_LEFT_PX:.0f}" y="{top:.0f}" width="{wide:.0f}" height="{_PLOT_PX:.0f}" fill="none" stroke="#d5ddd6"/>',
-        *(f'<text x="{_LEFT_PX - 6:.0f}" y="{y(m) + 4:.1f}" text-anchor="end" fill="{_FAINT}">{m:.2f} m</text>' for m in (high, *_DOCK_M, low)),
-        f'<text x="{_LEFT_PX:.0f}" y="{top - 5:.0f}" font-weight="600">distance to the tree, green where it is docked</text>',
+        *(f'<text x="{_LEFT_PX - 6:.0f}" y="{y(m) + 4:.1f}" text-anchor="end" fill="{_FAINT}">{m:.2f} m</text>' for m in labels),
+        f'<text x="{_LEFT_PX:.0f}" y="{top - 5:.0f}" font-weight="600">distance to the tree, green where it is docked ({_DOCK_M[0]:.2f} to {_DOCK_M[1]:.2f} m)</text>',
         f'<path d="{"".join(path)}" fill="none" stroke="{_LINE}" stroke-width="1.8"/>',
     ]  # fmt: skip

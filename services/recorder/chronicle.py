@@ -34,11 +34,13 @@ class Chronicle:
         self._seen = Rows(SIGHTING, _MOST_TARGETS)
         self._clouds: dict[int, Submap] = {}
         """Thinned; of the points alone is made use."""
+        self.reported = False
+        """Whether this mission's report was written; who writes it says so."""
 
     @property
-    def told(self) -> bool:
-        """Whether any mission was heard of."""
-        return any(state.state != "idle" for state in self._story.states)
+    def owed(self) -> bool:
+        """Whether a mission was heard of whose report was not written."""
+        return not self.reported and any(state.state != "idle" for state in self._story.states)
 
     def hear(self, message: Wire) -> bool:
         """Take a message; return whether a mission has ended with it: its report is due."""
@@ -82,13 +84,14 @@ class Chronicle:
         last = story.states[-1] if story.states else None
         if last is not None and last.state in ENDS and state.state not in ENDS:
             # another mission in the same map: its path is its own, and those of a whole day would be too many
-            story.states, last = [], None
+            story.states, last, self.reported = [], None, False
             self._seen.clear()
             self._path.clear()
         if last is not None and (last.state, last.reason) == (state.state, state.reason):
             return False
-        if len(story.states) < _MOST_STATES:
-            story.states.append(state)
+        if len(story.states) >= _MOST_STATES:
+            story.states.pop()  # the newest takes its place: how a mission ended is known however much it told
+        story.states.append(state)
         return state.state in ENDS and (last is None or last.state not in ENDS)
 
     def story(self) -> Story:

@@ -83,7 +83,7 @@ class RecorderService:
         self._mender = Mender(config.folder, config.reserve_mb) if config.mcap else None
         self._told: dict[str, int] = {}
         self._chronicle = Chronicle(context.uav)
-        self._reports, self._reported = 0, False
+        self._reports = 0
 
     def take(self, topic: Topic, message: Wire) -> None:
         """Queue one message, and what Foxglove shows of it; write the report when a mission has ended with it."""
@@ -121,7 +121,7 @@ class RecorderService:
         """Complete the file; tell of a mission that had not ended."""
         if self._mender is not None:
             self._mender.stop()
-        if self._chronicle.told and not self._reported:
+        if self._chronicle.owed:
             self._report()
         if self.drain is not None:
             self.drain.close()
@@ -138,7 +138,7 @@ class RecorderService:
         except InputError as error:
             self._context.health.note("report", str(error))
             return
-        self._reported = True
+        self._chronicle.reported = True
         LOG.info("report: %s", path)
 
     def _open_file(self) -> McapFile:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -113,6 +114,48 @@ def test_no_float_may_be_nan_or_infinite(name: str, value: float) -> None:
     for variant in poisoned(body, value):
         with pytest.raises(DecodeError):
             decode(type(example), msgpack.packb(variant))
+
+
+def renumbered(body: Any, number: int, field: str = "") -> list[Any]:
+    """Return copies of a msgpack body, each with one tree's number replaced."""
+    if isinstance(body, int) and re.fullmatch(r"id|(\w+_)?tree_ids?", field):
+        return [number]
+    if not isinstance(body, dict | tuple):
+        return []
+    out: list[Any] = []
+    for key, item in body.items() if isinstance(body, dict) else enumerate(body):
+        for variant in renumbered(item, number, key if isinstance(key, str) else field):
+            copy = dict(body) if isinstance(body, dict) else list(body)
+            copy[key] = variant
+            out.append(copy)
+    return out
+
+
+NUMBERED = {
+    "treedock.claim",
+    "treedock.command",
+    "treedock.held",
+    "treedock.mission",
+    "treedock.target",
+    "treedock.trees",
+}
+
+
+@pytest.mark.parametrize("number", [-1, 2**63, 2**64 - 1])
+def test_the_numbers_of_trees_fit_64_bits_everywhere(number: int) -> None:
+    """One such message ended the recorder: OverflowError, where its row was written."""
+    found = set()
+    for name, example in EXAMPLES.items():
+        if not isinstance(example, Message):
+            continue
+        body = msgpack.unpackb(bytes(encode(example)), use_list=False)
+        for variant in renumbered(body, number):
+            found.add(name)
+            with pytest.raises(DecodeError, match=r"tree|\bid\b"):
+                decode(type(example), msgpack.packb(variant))
+        for variant in renumbered(body, 2**63 - 1):
+            decode(type(example), msgpack.packb(variant))
+    assert found >= NUMBERED
 
 
 def test_another_version_is_refused_by_name() -> None:

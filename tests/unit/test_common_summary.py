@@ -57,3 +57,4 @@ def test_the_closing_line_counts() -> None:
         "2 trees found, 1 suitable; of 2 true suitable ones 1 found, 0 false; 40 frames in 12 s, 1 restarts, "
         "4 samples dropped"
     )
+    assert closing_line({**values, "trees": values["trees"][:1]}).startswith("1 tree found, 1 suitable")

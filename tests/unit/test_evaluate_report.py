@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from schemas.trees import Target, Tree, TreeList
+from services.evaluate.report import STYLE, tree_table
 from services.evaluate.report_pictures import cross_section_svg, filter_plots_svg
 from services.evaluate.sightings import sightings
 from tests.examples import all_messages
@@ -86,6 +87,15 @@ def test_lines_break_where_another_tree_is_tracked_or_none_for_a_while() -> None
 def test_frames_without_a_measurement_have_no_dot() -> None:
     targets = [target(n, raw_range_m=None, raw_radius_m=None, raw_image_x_px=None) for n in range(10)]
     assert len(re.findall(r'r="1\.6"', filter_plots_svg(sightings(targets)))) == 0
+
+
+def test_the_table_of_trees_fits_the_page() -> None:
+    far = TREE.model_copy(update={"id": 1234, "x_m": -123.45, "y_m": -123.45, "z_m": -12.34})
+    rows = [re.findall(r"<t[hd]>(.*?)</t[hd]>", line) for line in tree_table([far]).splitlines() if "<tr>" in line]
+    letters = sum(max(len(cell) for cell in column) for column in zip(*rows, strict=True))
+    padding = re.search(r"th, td { padding: [\d.]+rem ([\d.]+)rem", STYLE)
+    assert padding is not None
+    assert 9.0 * letters + 2 * 16.0 * float(padding[1]) * len(rows[0]) <= 16.0 * (60 - 2), "9 px a letter, 16 px a rem"
 
 
 @pytest.mark.parametrize("targets", [[], [target(1)], [target(n, status="lost") for n in range(9)]])

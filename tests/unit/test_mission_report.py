@@ -11,6 +11,8 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from schemas.navigation import MissionState
 from schemas.slam import Pose, Transform
@@ -22,7 +24,8 @@ from services.common.geometry import pose as matrix
 from services.common.geometry import rotation_z
 from services.common.memory import Hub
 from services.evaluate.mission_report import Story, mission_report
-from services.evaluate.sightings import sightings
+from services.evaluate.sightings import SIGHTING, Sightings, sightings
+from services.evaluate.timeline import timeline_svg
 from services.recorder.chronicle import Chronicle
 from services.recorder.chronicle import Path as FlownPath
 from services.recorder.config import RecorderConfig
@@ -92,6 +95,15 @@ def test_two_missions_are_two_reports_and_a_broken_one_is_told_at_the_stop(tmp_p
     assert recorded(tmp_path / "none", (state("idle", "waiting"),)) == []
 
 
+def test_a_second_mission_that_is_cut_off_has_its_report_too(tmp_path: Path) -> None:
+    second = (state("preflight", "start was commanded again", 103.0), state("approach", "on its way to 9", 104.0))
+    _, path = recorded(tmp_path / "cut", (*MISSION, *second))
+    page = path.read_text()
+    assert "on its way to 9" in page
+    assert "0.95 m for 3 s" not in page, "the first mission has its own report"
+    assert len(recorded(tmp_path / "idle", (*MISSION, state("idle", "waiting", 103.0)))) == 1
+
+
 def test_reports_alone_need_no_recording(tmp_path: Path) -> None:
     (path,) = recorded(tmp_path, MISSION, mcap=False)
     assert "0.95 m for 3 s" in path.read_text()
@@ -136,6 +148,64 @@ def test_the_page_says_how_it_ended_and_shows_it_over_time() -> None:
     assert 'class="verdict warn"' in failed
 
 
+def tracked(count: int, hz: float, begin_s: float = 1.0, tree_id: int = 7) -> Sightings:
+    """Return what was seen of one tree at a steady rate."""
+    seen = np.zeros(count, SIGHTING)
+    seen["stamp_ns"] = np.round((begin_s + np.arange(count) / hz) * SECOND)
+    seen["tree_id"], seen["tracking"], seen["range_m"] = tree_id, True, 1.5 + np.sin(np.arange(count) / 50)
+    return seen
+
+
+def flown(seconds: float) -> list[MissionState]:
+    return [MISSION[0].model_copy(update={"stamp_ns": round(s * SECOND)}) for s in (0.0, seconds)]
+
+
+def distance_line(svg: str) -> list[tuple[str, float, float]]:
+    (line,) = (p.attrib["d"] for p in ET.fromstring(svg).iter("path"))
+    return [(a, float(x), float(y)) for a, x, y in re.findall(r"([ML])([\d.]+) ([\d.]+)", line)]
+
+
+@given(st.integers(2, 20_000), st.floats(0.2, 30.0))
+def test_the_distance_is_one_line_however_long_the_flight(count: int, hz: float) -> None:
+    points = distance_line(timeline_svg(flown(2.0 + count / hz), tracked(count, hz)))
+    assert [a for a, _, _ in points].count("M") == 1
+    assert min(count, 1_400) <= len(points) <= 3_100
+    end_px = 62 + (720 - 68) * (1.0 + (count - 1) / hz) / (2.0 + count / hz)
+    assert points[-1][1] == pytest.approx(end_px, abs=0.1), "the end is there"
+
+
+def test_the_distance_breaks_where_another_tree_is_tracked_or_none_for_a_while() -> None:
+    parts = [tracked(9_000, 15.0), tracked(3_000, 15.0, 601.0, 8), tracked(3_000, 15.0, 802.0, 8)]
+    points = distance_line(timeline_svg(flown(1100.0), np.concatenate(parts)))
+    begun_px = [x for a, x, _ in points if a == "M"]
+    assert begun_px == pytest.approx([62 + (720 - 68) * s / 1100.0 for s in (1.0, 601.0, 802.0)], abs=0.1)
+
+
+@given(st.floats(0.3, 30.0), st.floats(0.0, 30.0))
+def test_the_labels_of_the_distance_do_not_lie_on_each_other(near_m: float, more_m: float) -> None:
+    seen = tracked(50, 15.0)
+    seen["range_m"] = np.linspace(near_m, near_m + more_m, 50)
+    svg = timeline_svg(flown(5.0), seen)
+    labels = [(float(t.attrib["y"]), t.text) for t in ET.fromstring(svg).iter("text") if (t.text or "").endswith(" m")]
+    assert np.diff(sorted(y for y, _ in labels)).min(initial=99.0) >= 12.0
+    assert "1.00 m" in [text for _, text in labels], "the band is what matters"
+    assert "0.85 to 1.00 m" in svg
+
+
+def test_one_tree_is_one_tree() -> None:
+    trees = example(TreeList).trees[:1]
+    page = mission_report(Story(uav="uav1", states=list(MISSION), trees=trees)).decode()
+    assert "<small>docked</small><b>1</b><small>tree</small>" in page
+    assert "<small>tree</small><b>1</b>" in page
+    assert "<small>docked</small><b>0</b><small>trees</small>" in mission_report(Story()).decode()
+
+
+def test_both_plots_of_a_mission_count_from_its_begin() -> None:
+    seen = tracked(300, 15.0, 21.0)
+    page = mission_report(Story(uav="uav1", states=list(MISSION), seen=seen)).decode()
+    assert "20.0 to 39.9 s" in page, "the mission began at 1 s"
+
+
 def test_a_submap_that_the_graph_moved_keeps_its_points() -> None:
     chronicle = Chronicle("uav1")
     whole = submap()
@@ -170,6 +240,16 @@ def test_another_mission_begins_the_path_anew_and_an_hour_of_them_is_not_piled_u
     chronicle.hear(pose(301.0, 7.0))
     assert begun > 40
     assert [T[0, 3] for _, T in chronicle.story().trajectory] == [7.0]
+
+
+def test_a_mission_of_too_many_states_still_ends_and_is_reported_once() -> None:
+    chronicle = Chronicle("uav1")
+    due = [chronicle.hear(state("scan", f"turn {k}", 0.1 * k)) for k in range(2_100)]
+    due += [chronicle.hear(state("landed", "down", 300.0)) for _ in range(3)]
+    assert [k for k, now in enumerate(due) if now] == [2_100]
+    states = chronicle.story().states
+    assert len(states) == 2_000
+    assert (states[0].reason, states[-1].state) == ("turn 0", "landed")
 
 
 def test_thinning_keeps_shape_and_ends() -> None:
@@ -209,3 +289,11 @@ def test_a_day_of_missions_takes_the_room_of_the_longest() -> None:
     tracemalloc.stop()
     assert len(chronicle.story().trajectory) == 2000
     assert held < 100e3
+
+
+@given(st.integers(0, 2**63 - 1), st.integers(0, 2**63 - 1))
+def test_whatever_decodes_is_heard(tree_id: int, stamp_ns: int) -> None:
+    body = {**example(Target).model_dump(), "tree_id": tree_id, "stamp_ns": stamp_ns}
+    chronicle = Chronicle("uav1")
+    chronicle.hear(Target.model_validate(body))
+    assert chronicle.story().seen["tree_id"].tolist() == [tree_id]
