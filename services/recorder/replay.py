@@ -101,7 +101,7 @@ def _length_s(file: Path, first_ns: int) -> float | None:
         run = summary(file)
     except InputError:
         return None  # damaged, and played as far as it goes
-    return 1e-9 * (run.begun_ns - first_ns) + run.seconds if run.whole and run.begun_ns else None
+    return 1e-9 * (run.begun_ns - first_ns) + run.seconds if run.counts else None
 
 
 def _refuse_beyond(file: Path, span: Span, length_s: float | None) -> None:
