@@ -24,7 +24,7 @@ def recordings(
     config: ConfigFile = None,
     settings: Settings = None,
 ) -> None:
-    """List recordings: when, how long, how big, frames and trees' versions in them."""
+    """List recordings: when, how long, how big, frames and versions of the trees in them."""
     from services.recorder.index import index
     from services.recorder.recover import recover_folder
 
@@ -56,4 +56,4 @@ def _line(run: Run) -> str:
         return f"{run.path.name}  {size:>10}  cut short or being written: --recover mends what nobody writes"
     frames = run.count("camera/rgbd_compressed") + run.count("camera/rgbd")
     begun = dict(run.about).get("begun_utc", "")
-    return f"{run.path.name}  {size:>10}  {run.seconds:7.1f} s  {frames:6d} frames  {begun}"
+    return f"{run.path.name}  {size:>10}  {run.seconds:7.1f} s  {frames:6d} frames  {run.count('trees/list'):4d} versions of the trees  {begun}"

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from services.cli.options import ConfigFile, Port, Settings, loaded
+
+if TYPE_CHECKING:
+    from services.recorder.replay import Played, Span
 
 
 def replay(
@@ -31,9 +34,17 @@ def replay(
     span = Span(begin, end, rate)
     check_span(span)
     result = play(loaded(config, settings, port).config, file, span, everything=everything)
-    typer.echo(f"{result.sent} messages of {file.name} in {result.seconds:.1f} s", err=True)
+    typer.echo(said(file, span, result), err=True)
     for fault in result.faults[:5]:
         typer.echo(f"left out: {fault}", err=True)
     if len(result.faults) > 5:
         typer.echo(f"left out: {len(result.faults) - 5} more", err=True)
     return 0 if result.sent else 3
+
+
+def said(file: Path, span: Span, played: Played) -> str:
+    """Return what was played in words; where that is less than was asked for, how long the recording is."""
+    less = not played.sent or (span.end_s is not None and span.end_s > played.length_s)
+    return f"{played.sent} messages of {file.name} in {played.seconds:.1f} s" + (
+        f"; the recording is only {played.length_s:.1f} s long" if less else ""
+    )

@@ -231,13 +231,16 @@ class Run:
             watch.pump(_LOOK_S)
             supervisor.check()
             self._raise_if_given_up(supervisor)
-            show()
+            over = False
             if conductor is not None:
-                conductor.word = _world_lost(supervisor) or conductor.word
-                if _world_lost(supervisor) or conductor.update(ready=supervisor.all_ready):
-                    return
+                lost = _world_lost(supervisor)
+                conductor.word = lost or conductor.word
+                over = bool(lost) or conductor.update(ready=supervisor.all_ready)
                 watch.word = conductor.headline()
-            elif watch.source_ended:
+            show()  # after the words were renewed: a state is shown with its own reason
+            if over:
+                return
+            if conductor is None and watch.source_ended:
                 ended_s = ended_s or time.monotonic()
                 late = time.monotonic() - ended_s > self._tree.supervisor.drain_within_s
                 if watch.drained or late:
@@ -254,7 +257,7 @@ class Run:
         if child.last_fault.endswith("exit code 2"):
             self._keep_logs = False
             raise _PortTakenError(last) if "in use" in last and child.name in _ON_PORTS else InputError(last)
-        raise GoalNotReachedError(f"{child.name} {child.last_fault} {child.deaths_in_a_row} times before it was ready: "
+        raise GoalNotReachedError(f"{child.name} {child.last_fault}, {child.deaths_in_a_row} starts in a row failed: "
                                   f"{last} (all of it in {self._folder / child.name}.log)")  # fmt: skip
 
     def _close(
@@ -299,10 +302,9 @@ class Run:
 def _world_lost(supervisor: Supervisor) -> str:
     """Return what became of the simulator when it died: another one is another world, and its time begins anew."""
     child = supervisor.children.get("simulator")
-    lost = child is not None and child.was_ready and child.restarts > 0
-    return (
-        f"the simulator {child.last_fault}: with it aircraft and world are gone" if child is not None and lost else ""
-    )
+    if child is None or not child.lost:  # killed while it still started, it took nothing along
+        return ""
+    return f"the simulator {child.lost}: with it aircraft and world are gone"
 
 
 def _stopped(stop: StopSignal) -> int:

@@ -120,7 +120,7 @@ class FleetRun:
         if child.last_fault.endswith("exit code 2"):
             raise InputError(last)
         raise GoalNotReachedError(
-            f"{child.name} {child.last_fault} {child.deaths_in_a_row} times before it was ready: {last}"
+            f"{child.name} {child.last_fault}, {child.deaths_in_a_row} starts in a row failed: {last}"
         )
 
     def _spawn_ground(self, name: str) -> subprocess.Popen[bytes]:

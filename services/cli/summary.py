@@ -43,6 +43,7 @@ def figures(watch: Watch, supervisor: Supervisor, duration_s: float) -> dict[str
             for name, health in sorted(watch.health.items())
         },
         "dropped": watch.dropped(),
+        "frames_left_out": watch.frames_left_out(),
         "restarts": {child.name: child.restarts for child in supervisor.children.values() if child.restarts},
     }
     if watch.truth is not None:
@@ -102,8 +103,11 @@ def closing_line(values: dict[str, Any]) -> str:
         line += f"; of {truth['suitable']} true suitable ones {truth['found']} found, {truth['false']} false"
     line += f"; {values['frames']} frames in {values['duration_s']:.0f} s"
     restarts = sum(values["restarts"].values())
-    dropped = sum(values["dropped"].values())
-    return line + (f", {restarts} restarts" if restarts else "") + (f", {dropped} samples dropped" if dropped else "")
+    frames = values["frames_left_out"]
+    others = sum(values["dropped"].values()) - sum(frames.values())
+    line += f", {restarts} restarts" if restarts else ""
+    line += f"; frames left out: {', '.join(f'{name} {count}' for name, count in frames.items())}" if frames else ""
+    return line + (f"; {others} other samples dropped" if others else "")
 
 
 def mission_lines(values: dict[str, Any]) -> list[str]:

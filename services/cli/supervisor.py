@@ -64,6 +64,8 @@ class Child:
     """By us; a process that the kernel holds ends some time later."""
     was_ready: bool = False
     """At any time: what it is started with was good once."""
+    lost: str = ""
+    """What ended it when it was ready, the last time; empty: what it did for others was never lost."""
 
     @property
     def alive(self) -> bool:
@@ -166,8 +168,10 @@ class Supervisor:
         return f"was silent for {silent_s:.0f} s" if silent_s > self.limits.hung_after_s else ""
 
     def _died(self, child: Child, code: int) -> None:
+        if not (child.killed and code == -signal.SIGKILL):  # else that we killed it is known, and why is kept
+            child.last_fault = _words(code)
+        child.lost = child.last_fault if child.ready else child.lost
         child.process, child.killed = None, False
-        child.last_fault = _words(code)
         child.deaths_in_a_row += 0 if child.ready else 1
         child.ready = False
         child.restarts += 1

@@ -24,6 +24,16 @@ _CHAIN = {
     "detector": ("map/cloud", ("trees/list",)),
 }
 """What must have fallen quiet before nothing is under way any more: input and outputs of each, upstream first."""
+_NUMBERED_AS_FRAMES = {
+    "camera/rgbd": "camera", "camera/rgbd_compressed": "camera", "second/rgbd": "second_camera",
+    "slam/pose": "slam", "second/pose": "second_slam", "trees/target": "refiner",
+}  # fmt: skip
+"""Topics whose messages have the number of the frame that they answer, and who answers it."""
+_FRAMES_LOST = frozenset({
+    "dropped.sim/rgbd", "dropped.sim/second", "dropped.camera/rgbd", "dropped.camera/rgbd_compressed", "dropped.second/rgbd",
+    "dropped_bad_frame", "dropped_bad_frames",
+})  # fmt: skip
+"""Counters of frames that came and were not seen, or could not be used: who counts them sends no answer to them."""
 
 
 @dataclass
@@ -83,12 +93,25 @@ class Watch:
         return all(self._quiet.get(name, 0) >= _QUIET_REPORTS for name in _CHAIN if name in self.health)
 
     def dropped(self) -> dict[str, int]:
-        """Return the dropped samples per service, where there are any."""
+        """Return the samples that each service itself lost, its frames among them, where there are any."""
+        return self._lost(lambda key: key.startswith("dropped"))
+
+    def frames_left_out(self) -> dict[str, int]:
+        """Return the frames that each service did not see or could not use, where there are any."""
+        return self._lost(_FRAMES_LOST.__contains__)
+
+    def _lost(self, counted: Callable[[str], bool]) -> dict[str, int]:
         sums = {
-            name: sum(count for key, count in health.counters.items() if key.startswith("dropped"))
+            name: sum(self._own(key, count) for key, count in health.counters.items() if counted(key))
             for name, health in self.health.items()
         }
         return {name: count for name, count in sorted(sums.items()) if count}
+
+    def _own(self, key: str, count: int) -> int:
+        """Return a count of lost samples without those that their producer never sent: its frames' gaps go on in them."""
+        health = self.health.get(_NUMBERED_AS_FRAMES.get(key.removeprefix("dropped."), ""))
+        unsent = 0 if health is None else sum(n for name, n in health.counters.items() if name in _FRAMES_LOST)
+        return max(0, count - unsent)
 
     def _on_health(self, message: Health) -> None:
         self.health[message.service] = message

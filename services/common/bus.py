@@ -44,6 +44,8 @@ _ON_CHANGE_RING = 256
 """Of topics without a rate: keyframes and submaps come in bursts, and none should be lost while a consumer works."""
 _QUERY_RING = 64
 _HEARTBEAT_S = 0.5
+_TIMED_OUT = "Timeout"
+"""Zenoh's own reply to a query whose time is up."""
 
 
 class Bus:
@@ -261,9 +263,13 @@ class Bus:
         self._kept.append(self.session.declare_queryable(key, direct))
 
     def ask(
-        self, topic: Topic, request: Wire | None, kind: type[A], timeout_s: float, leaf: str | None = None
-    ) -> list[A]:
-        """Query a key and return what decodes as ``kind`` within ``timeout_s``; never asked from a handler of itself."""
+        self, topic: Topic, request: Wire | None, kind: type[A], timeout_s: float, leaf: str | None = None, *,
+        quiet: bool = False,
+    ) -> list[A]:  # fmt: skip
+        """Query a key and return what decodes as ``kind`` within ``timeout_s``; never asked from a handler of itself.
+
+        ``quiet``: that no answer came in time is nothing to warn of.
+        """
         channel: zenoh.handlers.FifoChannel[zenoh.Reply] = zenoh.handlers.FifoChannel(4096)
         replies = self.session.get(
             topic.key(self.uav, leaf), channel, timeout=timeout_s,
@@ -275,7 +281,12 @@ class Bus:
         for reply in replies:
             if reply.ok is None:
                 words = bytes(reply.err.payload)[:200].decode(errors="replace") if reply.err else "nothing"
-                self._fault(topic.name, f"{topic.name} answered: {words}")
+                if words == _TIMED_OUT:
+                    level = logging.DEBUG if quiet else logging.WARNING
+                    words = f"{topic.name} was not answered within {timeout_s:g} s: who answers it is too busy, or the link is"
+                    self._throttle.log(LOG, level, topic.name, words)
+                else:
+                    self._fault(topic.name, f"{topic.name} answered: {words}")
                 continue
             try:
                 answers.append(self._decode(kind, reply.ok, getattr(kind, "MAX_BYTES", topic.max_bytes)))

@@ -22,6 +22,8 @@ FAR_NS = 20_000_000
 """Clocks farther apart than this are told in health; PX4 drops vision whose clock is 10 ms off for long."""
 _FIRST, _TIMEOUT_S = 5, 0.3
 _PERIOD_S = 2.0
+_UNTOLD_S = 30.0
+"""So long the clock goes on by itself before that is worth a word: quartz drifts by 1 ms in it, an answer lost is soon made up."""
 _YOUNG_S = 5.0
 """So soon after its start a service may still step: nobody rests on its stamps yet."""
 
@@ -30,8 +32,9 @@ class Asker(Protocol):
     """The bus, as far as it is needed here."""
 
     def ask(
-        self, topic: Topic, request: Wire | None, kind: type[ClockReply], timeout_s: float, leaf: str | None = None
-    ) -> Sequence[ClockReply]:
+        self, topic: Topic, request: Wire | None, kind: type[ClockReply], timeout_s: float, leaf: str | None = None, *,
+        quiet: bool = False,
+    ) -> Sequence[ClockReply]:  # fmt: skip
         """Query a key."""
         ...
 
@@ -48,6 +51,8 @@ class ClockSync:
         self._filter = OffsetFilter()
         self._begun_s = monotonic_s()
         self._measured = False
+        self._answered_s = self._begun_s
+        self._untold = False
 
     def begin(self) -> None:
         """Measure and correct at once; a router that does not answer (an older one) leaves the clock as it is."""
@@ -64,19 +69,34 @@ class ClockSync:
         while not stopped():
             time.sleep(_PERIOD_S)
             try:
-                if not stopped() and self._exchange():
-                    self._correct()
+                if not stopped():
+                    self.once()
             except zenoh.ZError as error:
                 if stopped():
                     return  # the session closed under the question
                 LOG.warning("the router's clock could not be asked: %s", error)
 
+    def once(self) -> None:
+        """Measure and correct once; after half a minute without an answer, say so."""
+        if self._exchange():
+            if self._untold:
+                LOG.info("the router tells the time again")
+            self._untold = False
+            self._correct()
+        elif not self._untold and self._monotonic_s() - self._answered_s >= _UNTOLD_S:
+            self._untold = True
+            LOG.warning(
+                "the router has not told the time for %.0f s, and this service's clock goes on by itself: is the machine too "
+                "busy, the link to the router too weak, or the router of an older version?", _UNTOLD_S,
+            )  # fmt: skip
+
     def _exchange(self) -> bool:
         """Ask once; return whether an answer came."""
         asked_ns = self._wall.machine_ns()
-        replies = self._asker.ask(CLOCK, self._request, ClockReply, _TIMEOUT_S)
+        replies = self._asker.ask(CLOCK, self._request, ClockReply, _TIMEOUT_S, quiet=True)
         if not replies:
             return False
+        self._answered_s = self._monotonic_s()
         self._filter.add(asked_ns, replies[0].stamp_ns, self._wall.machine_ns())
         return True
 

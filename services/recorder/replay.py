@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -15,6 +14,7 @@ from schemas.codec import Wire
 from schemas.topics import CAMERA_COMPRESSED, CAMERA_RGBD, TOPICS, VEHICLE_STATE, Topic
 from services.common.errors import InputError
 from services.doctor.twins import SINGLE
+from services.recorder.index import summary
 from services.recorder.reader import Recorded, messages
 
 if TYPE_CHECKING:
@@ -41,6 +41,8 @@ class Played:
 
     sent: int = 0
     seconds: float = 0.0
+    length_s: float = 0.0
+    """From the recording's first message of those topics to its end, as far as it is known."""
     faults: list[str] = field(default_factory=list)
 
 
@@ -67,15 +69,16 @@ def play(config: TreedockConfig, file: Path, span: Span, *, everything: bool = F
 
     stop = StopSignal()
     stop.install()
-    entries = messages(file, TOPICS if everything else SENSORS)
-    first = next((entry for entry in entries if isinstance(entry, Recorded)), None)
+    topics = TOPICS if everything else SENSORS
+    first = next((entry for entry in messages(file, topics) if isinstance(entry, Recorded)), None)
     if first is None:
         raise InputError(f"{file}: it holds nothing to replay; `treedock recordings` shows what is in a file")
+    _refuse_beyond(file, span, _length_s(file, first.stamp_ns))
     with opened_node(config, "camera", lambda: stop.is_set, wait_s=0.0) as session:
         bus = Bus(session, config.uav, HealthBook())
         others = SINGLE if everything else frozenset(topic.producer for topic in SENSORS)
         alone(bus, others)
-        return _play(bus, itertools.chain([first], entries), first.stamp_ns, span, stop, others)
+        return play_on(bus, file, messages(file, topics), span, stop, others)
 
 
 def alone(bus: Bus, others: Iterable[str]) -> None:
@@ -92,22 +95,41 @@ def alone(bus: Bus, others: Iterable[str]) -> None:
         )
 
 
-def _play(
-    bus: Bus,
-    entries: itertools.chain[Recorded | str],
-    first_ns: int,
-    span: Span,
-    stop: StopSignal,
-    others: Iterable[str],
+def _length_s(file: Path, first_ns: int) -> float | None:
+    """Return how long after ``first_ns`` a recording ends; None where only reading it through would tell."""
+    try:
+        run = summary(file)
+    except InputError:
+        return None  # damaged, and played as far as it goes
+    return 1e-9 * (run.begun_ns - first_ns) + run.seconds if run.counts else None
+
+
+def _refuse_beyond(file: Path, span: Span, length_s: float | None) -> None:
+    if length_s is not None and span.begin_s > length_s:
+        raise InputError(f"--from {span.begin_s:g} s: {file.name} is only {length_s:.1f} s long")
+
+
+def play_on(
+    bus: Bus, file: Path, entries: Iterable[Recorded | str], span: Span, stop: StopSignal, others: Iterable[str]
 ) -> Played:
+    """Play what ``file`` holds, ``entries``, onto the bus.
+
+    Raises:
+        InputError: the file ends before the span begins, or one of ``others`` was started.
+    """
     played, begin_s = Played(), time.monotonic()
-    # the moment of now at which the recording's start would lie: added to every stamp of the recording
-    moved_ns = time.time_ns() - first_ns - round(span.begin_s * 1e9)
+    first_ns, moved_ns = None, 0
     for entry in entries:
         if isinstance(entry, str):
             played.faults.append(entry)
             continue
+        if first_ns is None:
+            first_ns, begin_s = entry.stamp_ns, time.monotonic()
+            # the moment of now at which the recording's start would lie: added to every stamp of the recording
+            moved_ns = time.time_ns() - first_ns - round(span.begin_s * 1e9)
+            played.length_s = _length_s(file, first_ns) or 0.0
         at_s = 1e-9 * (entry.stamp_ns - first_ns)
+        played.length_s = max(played.length_s, at_s)
         if at_s < span.begin_s:
             continue
         if stop.is_set or (span.end_s is not None and at_s > span.end_s):
@@ -119,6 +141,8 @@ def _play(
         topic, message = _to_send(entry, moved_ns, at_s - span.begin_s, span.rate)
         bus.publish(topic, message, entry.leaf)
         played.sent += 1
+    if not stop.is_set:
+        _refuse_beyond(file, span, played.length_s)
     played.seconds = time.monotonic() - begin_s
     return played
 

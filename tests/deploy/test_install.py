@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -175,9 +176,38 @@ def test_the_commented_settings_are_real_ones(tmp_path: Path, role: str) -> None
     assert tomllib.loads(body)["security"]["folder"] == "/etc/treedock/certs"
     with pytest.raises(InputError, match="router2"):
         load(path, environ={}, system_directory=tmp_path / "none")
-    path.write_text(body.replace('folder = "/etc/treedock/certs"', ""))
+    path.write_text(body)
+    config = load(path, environ={}, system_directory=tmp_path / "none").config
+    assert config.router.protocol == "tls"
     if role == "aircraft":
-        assert load(path, environ={}, system_directory=tmp_path / "none").config.autopilot.vehicle == "real"
+        assert config.autopilot.vehicle == "real"
+
+
+def uncommented(text: str, *tables: str) -> str:
+    """Return a file of deploy/etc with the commented settings of these tables in force."""
+    lines, table = list[str](), ""
+    for line in text.splitlines():
+        setting = re.fullmatch(r"# (\[\w+\]|\w+ = .*)", line)
+        if head := re.fullmatch(r"(?:# )?\[(\w+)\]", line):
+            table = head[1]
+        lines.append(setting[1] if setting and table in tables else line)
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in (ROOT / "deploy/etc").iterdir()))
+def test_every_commented_block_can_be_uncommented_as_it_is_meant(tmp_path: Path, name: str) -> None:
+    text = (ROOT / "deploy/etc" / name).read_text().replace("@UAV@", "uav1")
+    tables = re.findall(r"^(?:# )?\[(\w+)\]", text, re.MULTILINE)
+    assert "security" in tables
+    together = {"security": ("security", "router"), "router": ("security", "router")}
+    path = tmp_path / name
+    for chosen in [tables, *(together.get(table, (table,)) for table in tables)]:
+        path.write_text(uncommented(text, *chosen))
+        tree = load(path, environ={}, system_directory=tmp_path / "none").config
+        for table, values in tomllib.loads(path.read_text()).items():
+            if isinstance(values, dict):
+                told = getattr(tree, table).model_dump(mode="json", include=set(values))
+                assert told == values, f"{chosen}: [{table}]"
 
 
 def test_again_changes_nothing_and_keeps_the_administrators_file(tmp_path: Path) -> None:

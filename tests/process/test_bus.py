@@ -239,3 +239,22 @@ def test_a_service_lives_by_the_simulators_time_but_tells_its_health_by_the_wall
             bus.publish(SIM_CLOCK, SimClock(stamp_ns=tenth * 100_000_000, seq=tenth, phase="running", frames=0))
             time.sleep(0.01)
         assert until(lambda: health.counter("ticker", "ticks") == 3, bus=bus), health.latest
+
+
+def test_a_question_that_nobody_answers_in_time_is_told_in_plain_words(
+    routed: System, caplog: pytest.LogCaptureFixture
+) -> None:
+    with routed.bus() as bus, routed.bus() as other, caplog.at_level("DEBUG"):
+        queries: list[zenoh.Query] = []  # kept: nobody answers, and nobody says that he does not
+        other.session.declare_queryable(TREES_LIST.key("uav1"), queries.append)
+        assert until(lambda: bus.ask(TREES_LIST, None, TreeList, 0.2) == [] and bool(queries))
+        told = [r for r in caplog.records if "trees/list" in r.getMessage()]
+        assert (
+            "trees/list was not answered within 0.2 s: who answers it is too busy, or the link is"
+            in told[0].getMessage()
+        )
+        assert told[0].levelname == "WARNING"
+        caplog.clear()
+        bus.ask(TREES_LIST, None, TreeList, 0.2, quiet=True)
+        assert not [r for r in caplog.records if r.levelname != "DEBUG"]
+    assert "Timeout" not in caplog.text

@@ -171,3 +171,38 @@ def test_a_mission_whose_simulator_died_ends_and_says_so() -> None:
     made._watch_over(supervisor.supervisor, watch, show, StopSignal(), told)  # type: ignore[arg-type]
     assert "simulator" in told.word
     assert "SIGKILL" in told.word
+
+
+def test_a_simulator_that_was_slow_to_start_has_lost_no_world() -> None:
+    """Killed while it still started, then ready: the run goes on."""
+    supervisor = Bench("router", "simulator")
+    supervisor.after(0.0)
+    supervisor.ready("router")
+    supervisor.spawned[1].code = -9
+    supervisor.after(1.0)
+    supervisor.ready("simulator")
+    assert supervisor.supervisor.restarts == 1
+    assert not run_module._world_lost(supervisor.supervisor)
+    supervisor.spawned[-1].code = -9
+    supervisor.after(0.1)
+    assert "SIGKILL" in run_module._world_lost(supervisor.supervisor)
+
+
+def test_state_and_reason_of_a_line_belong_together() -> None:
+    supervisor, told, lines = Bench("navigator"), SimpleNamespace(word="", state="idle"), list[str]()
+    states = iter(["preflight", "scan", "landed"])
+    told.headline = lambda: f"reason of {told.state}"
+    told.update = lambda **_: told.state == "landed"
+    watch = SimpleNamespace(word="")
+
+    def pump(_: float) -> None:
+        told.state = next(states)
+
+    watch.pump = pump
+    made = object.__new__(Run)
+
+    def show() -> None:
+        lines.append(f"{told.state}: {watch.word}")
+
+    made._watch_over(supervisor.supervisor, watch, show, StopSignal(), told)  # type: ignore[arg-type]
+    assert lines == [f"{state}: reason of {state}" for state in ("preflight", "scan", "landed")]

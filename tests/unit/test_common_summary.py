@@ -6,10 +6,12 @@ import io
 
 from rich.console import Console
 
+from schemas.health import Health
 from schemas.simulation import SimTruth, TrueTree
 from schemas.slam import Transform
 from schemas.trees import Tree, TreeList
 from services.cli.summary import closing_line, pair, tree_table
+from services.cli.watch import Watch
 
 
 def tree(number: int, x_m: float, *, suitable: bool = True) -> Tree:
@@ -51,10 +53,42 @@ def test_the_closing_line_counts() -> None:
     values = {
         "trees": [tree(1, 0.0).model_dump(), tree(2, 1.0, suitable=False).model_dump()],
         "truth": {"suitable": 2, "found": 1, "false": 0}, "frames": 40, "duration_s": 12.3,
-        "restarts": {"slam": 1}, "dropped": {"slam": 3, "camera": 1},
+        "restarts": {"slam": 1}, "dropped": {"slam": 3, "preview": 2, "camera": 1},
+        "frames_left_out": {"slam": 3, "preview": 1},
     }  # fmt: skip
     assert closing_line(values) == (
-        "2 trees found, 1 suitable; of 2 true suitable ones 1 found, 0 false; 40 frames in 12 s, 1 restarts, "
-        "4 samples dropped"
+        "2 trees found, 1 suitable; of 2 true suitable ones 1 found, 0 false; 40 frames in 12 s, 1 restarts; "
+        "frames left out: slam 3, preview 1; 2 other samples dropped"
     )
     assert closing_line({**values, "trees": values["trees"][:1]}).startswith("1 tree found, 1 suitable")
+    values |= {"restarts": {}, "dropped": {}, "frames_left_out": {}}
+    assert closing_line(values).endswith("40 frames in 12 s")
+
+
+def watch_of(**counters: dict[str, int]) -> Watch:
+    made = object.__new__(Watch)
+    made.health = {
+        name: Health(service=name, stamp_ns=0, seq=0, state="ready", pid=1, uptime_s=1.0, counters=counts, rates_hz={},
+                     work_ms={})
+        for name, counts in counters.items()
+    }  # fmt: skip
+    return made
+
+
+def test_a_frame_that_slam_left_out_is_counted_once_not_by_each_listener_of_its_poses() -> None:
+    """As `treedock run --source mcap:...` was on a busy machine: 448 frames became 4155 dropped samples."""
+    gap = {"dropped.slam/pose": 448}
+    watch = watch_of(
+        camera={"dropped_bad_frame": 1, "frames": 845},
+        slam={"dropped.camera/rgbd": 447, "dropped_bad_frames": 2, "frames": 398},
+        refiner=gap | {"dropped.camera/rgbd": 145}, detector=gap | {"dropped.trees/target": 145, "dropped.map/cloud": 6},
+        station=gap | {"dropped.trees/target": 145}, preview=gap | {"dropped.slam/pose": 460}, navigator={},
+    )  # fmt: skip
+    assert watch.frames_left_out() == {"camera": 1, "refiner": 144, "slam": 448}
+    assert watch.dropped() == {"camera": 1, "detector": 6, "preview": 11, "refiner": 144, "slam": 448}
+
+
+def test_what_a_service_loses_by_itself_is_its_own() -> None:
+    watch = watch_of(slam={}, recorder={"dropped_slow_disk": 7}, station={"dropped.slam/pose": 5})
+    assert watch.frames_left_out() == {}
+    assert watch.dropped() == {"recorder": 7, "station": 5}

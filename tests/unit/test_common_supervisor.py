@@ -244,3 +244,28 @@ def test_who_slept_takes_nobody_for_hung() -> None:
     assert not bench.spawned[0].signals
     bench.after(1.0)
     assert bench.spawned[0].signals == [signal.SIGKILL], "its own silence counts on"
+
+
+def test_why_it_was_killed_is_kept_and_a_start_that_took_too_long_is_no_loss() -> None:
+    bench = Bench("simulator")
+    bench.after(LIMITS.start_within_s + 1.0)
+    assert bench.spawned[0].signals == [signal.SIGKILL]
+    bench.after(1.0)
+    child = bench.supervisor.children["simulator"]
+    assert child.last_fault == "was not ready after 60 s"
+    bench.ready("simulator")
+    assert not child.lost, "nobody had it yet"
+    bench.after(6.0)
+    bench.after(1.0)
+    assert child.lost == child.last_fault == "was silent for 6 s"
+
+
+def test_what_ended_by_itself_before_the_kill_reached_it_says_how() -> None:
+    bench = Bench("camera")
+    bench.after(0.0)
+    bench.spawned[0].undying = True
+    bench.after(LIMITS.start_within_s + 1.0)
+    bench.spawned[0].code = 2
+    bench.after(0.1)
+    assert bench.supervisor.given_up is bench.supervisor.children["camera"]
+    assert bench.supervisor.children["camera"].last_fault == "ended with exit code 2"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -17,16 +18,18 @@ from services.camera.config import CameraConfig
 from services.camera.depth.config import DepthConfig
 from services.camera.sources import open_recording
 from services.cli.app import invoke
+from services.cli.replay import said
 from services.common.errors import InputError
+from services.common.stop import StopSignal
 from services.recorder.config import RecorderConfig
 from services.recorder.foxglove import Translator
 from services.recorder.index import index
 from services.recorder.mcap_file import McapFile
 from services.recorder.reader import Recorded, messages
-from services.recorder.replay import Span, check
+from services.recorder.replay import SENSORS, Played, Span, check, play_on
 from services.recorder.service import recorded_topics
 from tests.examples import submap, without_points
-from tests.unit.recorder_files import MB, example, frame, recorded
+from tests.unit.recorder_files import MB, cut_at, example, frame, recorded
 
 
 def test_what_is_recorded_follows_the_table() -> None:
@@ -122,7 +125,8 @@ def test_recordings_are_listed_and_cut_ones_told(tmp_path: Path, capsys: pytest.
     assert not runs["cut.mcap"].whole
     assert invoke(["recordings", str(tmp_path)]) == 0
     out = capsys.readouterr().out
-    assert "12 frames" in out
+    assert "12 frames  " in out
+    assert "12 versions of the trees" in out
     assert "cut short" in out
     assert invoke(["recordings", str(tmp_path), "--recover"]) == 0
     assert "cut short or" not in capsys.readouterr().out
@@ -138,3 +142,31 @@ def test_replay_refuses_what_it_cannot_play(tmp_path: Path) -> None:
     assert invoke(["replay", str(tmp_path / "none.mcap")]) == 2
     (tmp_path / "x.mcap").write_text("text")
     assert invoke(["replay", str(tmp_path / "x.mcap")]) == 2
+
+
+def test_a_replay_from_beyond_the_end_is_refused_and_says_how_long_the_file_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = recorded(tmp_path)
+    assert invoke(["replay", str(path), "--from", "500"]) == 2
+    assert f"--from 500 s: {path.name} is only 0.7 s long" in capsys.readouterr().err
+    cut_at(path, 0.8)
+    with pytest.raises(InputError, match=r"only 0\.\d s long"):
+        played(path, Span(500.0))
+
+
+def test_a_replay_of_nothing_says_how_long_the_recording_is(tmp_path: Path) -> None:
+    path = recorded(tmp_path)
+    short = Span(0.01, 0.02)
+    assert said(path, short, played(path, short)) == (
+        f"0 messages of {path.name} in 0.0 s; the recording is only 0.7 s long"
+    )
+    late = Span(0.7, 60.0)
+    assert said(path, late, played(path, late)).endswith("; the recording is only 0.7 s long")
+    last = Span(0.7)
+    assert "long" not in said(path, last, played(path, last))
+
+
+def played(path: Path, span: Span) -> Played:
+    bus: Any = SimpleNamespace(uav="uav1", alive=lambda _: False, publish=lambda *_: None)
+    return play_on(bus, path, messages(path, SENSORS), span, StopSignal(), ())

@@ -72,6 +72,33 @@ def test_without_an_answer_the_clock_is_left_alone() -> None:
     assert stepped == []
 
 
+def test_a_router_that_does_not_tell_the_time_for_long_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    now_s = [100.0]
+    router = Router(0)
+    sync = ClockSync("slam", WallClock(), router, lambda _: None, lambda: now_s[0])
+    sync.begin()
+    router.there = False
+
+    def goes_on(seconds: int) -> list[str]:
+        caplog.clear()
+        for _ in range(seconds // 2):
+            now_s[0] += 2.0
+            sync.once()
+        return [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+
+    with caplog.at_level("INFO"):
+        assert goes_on(28) == [], "one answer lost, or ten, are no fault: the clock goes on"
+        told = goes_on(600)
+        assert len(told) == 1
+        assert "the router has not told the time for 30 s" in told[0]
+        assert "is the machine too busy" in told[0]
+        router.there = True
+        assert goes_on(2) == []
+        assert "again" in caplog.text
+        router.there = False
+        assert len(goes_on(40)) == 1
+
+
 def test_a_later_offset_is_slewed_in_and_time_never_runs_back() -> None:
     wall = WallClock()
     wall.correct(-OFF_NS)
