@@ -95,8 +95,8 @@ def _soak_flights(
     folder: Path, seed: int, for_s: float, write: Write, tell: Callable[[str], None], speed: float
 ) -> None:
     config = flight_config(seed, folder, speed=speed)
-    # the disk holds an hour, but no more
-    config = config.model_copy(update={"recorder": config.recorder.model_copy(update={"frames": "off", "file_mb": 50})})
+    # no frames, for the disk's sake; a file is then begun as often as with them, every ten minutes: its index is held until it is closed
+    config = config.model_copy(update={"recorder": config.recorder.model_copy(update={"frames": "off", "file_mb": 10})})
     with Rig(config, folder, (*ONBOARD, *GROUND, "simulator")) as rig:
         flights = Flights(rig, np.random.default_rng(seed), tell)
         flights.begin()
