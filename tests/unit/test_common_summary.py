@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import io
 
 from rich.console import Console
@@ -50,7 +52,7 @@ def test_the_table_shows_the_found_beside_the_true_and_the_missed() -> None:
 
 
 def test_the_closing_line_counts() -> None:
-    values = {
+    values: dict[str, Any] = {
         "trees": [tree(1, 0.0).model_dump(), tree(2, 1.0, suitable=False).model_dump()],
         "truth": {"suitable": 2, "found": 1, "false": 0}, "frames": 40, "duration_s": 12.3,
         "restarts": {"slam": 1}, "dropped": {"slam": 3, "preview": 2, "camera": 1},
