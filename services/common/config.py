@@ -74,7 +74,7 @@ class TreedockConfig(BaseModel):
             raise ValueError(f"router.protocol {self.router.protocol} needs security.folder (see `treedock certs`)")
         if self.security.folder is not None and not encrypted:
             raise ValueError("security.folder is set, but router.protocol is tcp: set it to tls, or to quic")
-        if not self.navigator.handheld and self.navigator.dock.min_m < self.camera.min_range_m:
+        if self.autopilot.vehicle == "real" and self.navigator.dock.min_m < self.camera.min_range_m:
             raise ValueError(
                 f"navigator.dock.min_m {self.navigator.dock.min_m:g} is nearer than camera.min_range_m {self.camera.min_range_m:g}: the camera "
                 "sees no trunk there"

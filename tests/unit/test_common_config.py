@@ -161,7 +161,7 @@ def test_a_limit_in_the_wrong_unit_is_refused_not_a_failsafe_less(tmp_path: Path
     (["navigator.aircraft_radius_m=0.9"], "safety_radius_m"),
     (["navigator.aircraft_radius_m=0.9", "navigator.safety_radius_m=1.3"], "1.1 at least"),
     (["navigator.dock.min_m=0.2", "navigator.dock.aim_m=0.3", "navigator.dock.max_m=0.4"], "0.55 at least"),
-    (["camera.min_range_m=1.0"], "sees no trunk"),
+    (["camera.min_range_m=1.0", "autopilot.vehicle=real"], "sees no trunk"),
     (["navigator.flight_height_m=4"], "motion.fence_height_m"),
     (["navigator.motion.fence_height_m=0.5"], "flight_height_m"),
     (["navigator.start_height_m=1.7"], "before take-off"),
