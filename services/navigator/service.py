@@ -35,7 +35,7 @@ from schemas.trees import Target, TreeList
 from schemas.vehicle import VehicleState
 from services.camera.depth_codec import FrameError, decode_depth
 from services.common.context import Context
-from services.common.process import take_small_arrays
+from services.common.process import take_small_arrays, take_small_objects
 from services.doctor.model import ServiceFact
 from services.doctor.told import told
 from services.doctor.twins import Twins
@@ -239,5 +239,6 @@ class Navigator:
 def build(context: Context) -> None:
     """Start the navigator on a context."""
     take_small_arrays()  # each view has its own number of rays that saw something
+    take_small_objects()  # a plan round many things
     config = getattr(context.config, "navigator", None) or NavigatorConfig()
     Navigator(context, config, fused=context.config.fusion.enabled).register(config.rate_hz)

@@ -233,6 +233,24 @@ def test_arrays_of_many_lengths_take_no_more_memory_once_it_is_taken(*, taken: b
     assert grown_mb < 1.0 if taken else grown_mb > 2.0, "without it there is growth, or this test shows nothing"
 
 
+@pytest.mark.parametrize("taken", [True, False])
+def test_a_busy_moment_takes_no_more_memory_once_its_room_is_taken(*, taken: bool) -> None:
+    grown_mb = float(subprocess.check_output([sys.executable, "-c", _BUSY_MOMENT, str(taken)], cwd=ROOT))
+    assert grown_mb < 0.5 if taken else grown_mb > 1.0, "without it there is growth, or this test shows nothing"
+
+
+_BUSY_MOMENT = """
+import resource, sys
+from services.common.process import take_small_objects
+def resident_mb():
+    return int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize() / 1e6
+if sys.argv[1] == "True":
+    take_small_objects()
+before = resident_mb()
+moment = [(k, 0.5 * k) for k in range(10_000)]
+print(resident_mb() - before)
+"""
+
 _MANY_LENGTHS = """
 import resource, sys
 import numpy as np
