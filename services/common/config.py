@@ -68,7 +68,11 @@ class TreedockConfig(BaseModel):
 
     @model_validator(mode="after")
     def _agrees(self) -> TreedockConfig:
-        """Certificates on a plain bus would guard nothing; an encrypted one without them admits nobody; and so on."""
+        """Refuse sections that contradict each other.
+
+        Certificates on a plain bus would guard nothing, an encrypted one without them admits nobody; a real aircraft neither flies
+        on an open bus nor docks where its camera is blind.
+        """
         encrypted = self.router.protocol != "tcp"
         if encrypted and self.security.folder is None:
             raise ValueError(f"router.protocol {self.router.protocol} needs security.folder (see `treedock certs`)")

@@ -21,6 +21,9 @@ BACKGROUND: Mapping[str, int] = {"mapper": 10, "detector": 10, "recorder": 10, "
 _STARTING_OBJECTS = 50_000
 """New objects between two looks of the garbage collector while libraries load: the usual 700 cost a fifth of the start."""
 _USUAL = gc.get_threshold()
+_SMALL_BYTES = 400
+"""Python keeps objects of up to 512 bytes, head included, in room of its own."""
+_KEPT: list[bytes] = []
 
 
 def prepare_process() -> None:
@@ -98,7 +101,3 @@ def take_small_objects(megabytes: int = 3) -> None:
     """
     held = [bytes(_SMALL_BYTES) for _ in range(megabytes * 2**20 // (_SMALL_BYTES + sys.getsizeof(b"")))]
     _KEPT.extend(held[:: len(held) // (4 * megabytes)])  # a megabyte in which one lives is not given back
-
-
-_SMALL_BYTES = 400
-_KEPT: list[bytes] = []

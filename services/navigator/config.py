@@ -9,6 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from services.fleet.config import ClaimConfig
 
+_BARK_M = 0.2
+"""The largest radius that is docked at, as detector.slicing.max_suitable_radius_m by default."""
+
 
 class MotionConfig(BaseModel):
     """What no setpoint may exceed. Metres, seconds, radians; heights above the ground at the start."""
@@ -197,7 +200,3 @@ class NavigatorConfig(BaseModel):
                 "above the ground before take-off"
             )
         return self
-
-
-_BARK_M = 0.2
-"""The largest radius that is docked at, as detector.slicing.max_suitable_radius_m by default."""
