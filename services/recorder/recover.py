@@ -6,7 +6,9 @@ and the walk goes on after it. The original is kept (``.cut``) when anything but
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
+import logging
 import os
 import struct
 from collections.abc import Iterator
@@ -19,6 +21,8 @@ from services.common.errors import InputError
 if TYPE_CHECKING:
     from mcap.records import Channel, McapRecord
     from mcap.writer import Writer
+
+LOG = logging.getLogger(__name__)
 
 MAGIC = b"\x89MCAP0\r\n"
 _FOOTER_BYTES = 9 + 20 + len(MAGIC)
@@ -75,12 +79,18 @@ def recover_folder(folder: Path) -> list[Recovered]:
 
 
 def cut_recordings(folder: Path) -> list[Path]:
-    """Return the recordings of a folder that lack their end and that nobody is writing."""
+    """Return the recordings of a folder that lack their end and that nobody is writing or mending.
+
+    What this user may not read is passed over, with a warning: one foreign file is no reason not to record.
+    """
     found = []
     for path in sorted(folder.glob("*.mcap")):
-        with path.open("rb") as stream:
-            if not (_ends_well(stream) or _is_being_written(stream)):
-                found.append(path)
+        try:
+            with path.open("rb") as stream:
+                if not (_ends_well(stream) or _is_being_written(stream)):
+                    found.append(path)
+        except OSError as error:
+            LOG.warning("%s: cannot be looked at: %s; whose is it (ls -l)?", path, error.strerror)
     return found
 
 
@@ -94,10 +104,10 @@ def _is_being_written(stream: BinaryIO) -> bool:
 
 
 def recover(path: Path) -> Recovered:
-    """Write a cut recording anew, with its index.
+    """Write a cut recording anew, with its index; the new file has the old one's owner and rights.
 
     Raises:
-        InputError: it is no MCAP file at all, or the new one cannot be written.
+        InputError: it is no MCAP file at all, somebody writes or mends it now, or the new one cannot be written.
     """
     from mcap.writer import CompressionType, Writer
 
@@ -105,7 +115,7 @@ def recover(path: Path) -> Recovered:
 
     fresh = path.with_name(f".{path.name}.recovering")
     try:
-        with path.open("rb") as stream, fresh.open("wb") as out:
+        with _held(path) as stream, _beside(fresh, stream) as out:
             if stream.read(len(MAGIC)) != MAGIC and path.stat().st_size >= len(MAGIC):
                 raise InputError(f"{path}: no MCAP file: it begins with something else")
             writer = Writer(out, chunk_size=512 * 1024, compression=CompressionType.ZSTD)
@@ -118,14 +128,39 @@ def recover(path: Path) -> Recovered:
             writer.finish()
             out.flush()
             os.fsync(out.fileno())  # before it takes the place of the only one there is
-        if walk.chunks_lost:
-            path.replace(path.with_name(path.name + ".cut"))
-        fresh.replace(path)
+            if walk.chunks_lost:
+                path.replace(path.with_name(path.name + ".cut"))
+            fresh.replace(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be mended: {error.strerror}") from error
+    return Recovered(path, copy.messages, walk.chunks_lost)
+
+
+@contextlib.contextmanager
+def _held(path: Path) -> Iterator[BinaryIO]:
+    """Open a recording and lock it as its writer does: of two menders, one would cut off the other's new file."""
+    with path.open("rb") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise InputError(f"{path}: is being written or mended by another process; nothing was done") from None
+        if not os.path.samestat(os.fstat(stream.fileno()), path.stat()):
+            raise InputError(f"{path}: was mended by another process meanwhile; nothing was done")
+        yield stream
+
+
+@contextlib.contextmanager
+def _beside(fresh: Path, original: BinaryIO) -> Iterator[BinaryIO]:
+    """Open the new file, readable for whom the original is; what is not put in its place is taken away again."""
+    like = os.fstat(original.fileno())
+    try:
+        with fresh.open("wb") as out:
+            os.fchmod(out.fileno(), like.st_mode & 0o777)
+            with contextlib.suppress(PermissionError):  # only root may give files away, and only root needs to
+                os.fchown(out.fileno(), like.st_uid, like.st_gid)
+            yield out
     finally:
         fresh.unlink(missing_ok=True)
-    return Recovered(path, copy.messages, walk.chunks_lost)
 
 
 class _Walk:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import random
 import signal
@@ -72,6 +73,44 @@ def test_what_is_no_recording_is_refused_or_empty(tmp_path: Path, content: bytes
         assert path.read_bytes() == content
     else:
         assert recover(path).messages == 0
+
+
+def test_of_two_menders_one_leaves_the_file_to_the_other(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    cut = recorded(tmp_path / "whole", frames=5).read_bytes()[:-100]
+    path.write_bytes(cut)
+    with path.open("rb") as first:
+        fcntl.flock(first, fcntl.LOCK_EX)
+        with pytest.raises(InputError, match="mended by another process; nothing was done"):
+            recover(path)
+        assert recover_folder(tmp_path) == [], "nor is it looked at"
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.mcap", "whole"]
+    assert path.read_bytes() == cut
+    assert recover(path).messages > 0
+
+
+def test_a_mended_file_keeps_its_owner_and_its_rights(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(recorded(tmp_path / "whole", frames=5).read_bytes()[:-100])
+    path.chmod(0o664)
+    if os.geteuid() == 0:
+        os.chown(path, 1234, 1235)
+    before, mask = path.stat(), os.umask(0o077)
+    try:
+        recover(path)
+    finally:
+        os.umask(mask)
+    after = path.stat()
+    assert (after.st_mode, after.st_uid, after.st_gid) == (before.st_mode, before.st_uid, before.st_gid)
+
+
+def test_one_file_that_cannot_be_read_does_not_keep_the_others_from_being_mended(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "a.mcap").mkdir()  # refuses to be opened, for root as well
+    (tmp_path / "b.mcap").write_bytes(recorded(tmp_path / "whole", frames=5).read_bytes()[:-100])
+    assert [done.path.name for done in recover_folder(tmp_path)] == ["b.mcap"]
+    assert "a.mcap: cannot be looked at" in caplog.text
 
 
 def test_a_file_being_written_is_left_alone(tmp_path: Path) -> None:
