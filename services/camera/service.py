@@ -110,7 +110,7 @@ class Replay:
         self._next: RgbdFrame | BadFrame | None = None
         self._done = False
         self._first_ns: int | None = None
-        self._begun_ns = 0
+        self._before_ns = self._begun_ns = 0
         self._last_ns: int | None = None
 
     def tick(self) -> None:
@@ -168,9 +168,10 @@ class Replay:
             self._done = True
             self._service.context.health.count("source_done")
             return False
-        if self._first_ns is None:
-            self._first_ns = self._next.stamp_ns
-            self._begun_ns = self._service.context.clock.now_ns()
+        stamp_ns = self._next.stamp_ns
+        if self._first_ns is None or stamp_ns - self._before_ns > JUMP_NS:  # a pause in a recording is not waited out
+            self._first_ns, self._begun_ns = stamp_ns, self._service.context.clock.now_ns()
+        self._before_ns = stamp_ns
         return True
 
     def _due_ns(self, stamp_ns: int) -> int:

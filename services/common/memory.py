@@ -60,7 +60,12 @@ class Hub:
                 handler(message)
 
     def advance_to(self, stamp_ns: int) -> None:
-        """Move time on to ``stamp_ns``, firing due timers in order of time and registration."""
+        """Move time on to ``stamp_ns``, firing due timers in order of time and registration.
+
+        A gap (a recording that paused, a clock that was set) is felt for its last minutes only: nothing happens in it, and
+        there may be decades between two stamps.
+        """
+        self._leap(stamp_ns - _FELT_NS)
         while True:
             due = min(self._timers, key=lambda timer: timer.due_ns, default=None)
             if due is None or due.due_ns > stamp_ns:
@@ -70,6 +75,14 @@ class Hub:
             due.handler()
             self.run()
         self.clock.set_ns(stamp_ns)
+
+    def _leap(self, to_ns: int) -> None:
+        """Let each timer miss what it would have done before ``to_ns``."""
+        if to_ns <= self.clock.now_ns():
+            return
+        self.clock.set_ns(to_ns)
+        for timer in self._timers:
+            timer.due_ns += max(0, -((timer.due_ns - to_ns) // timer.period_ns)) * timer.period_ns
 
     def stop(self) -> None:
         """Call what the services registered with ``on_stop``."""

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.common.geometry import Matrix
+from services.common.mount import Mount
 from services.evaluate.fusion_flight import FRAME_HZ, FlownWay
 from services.evaluate.slam_walk import CIRCUIT_M, HEIGHT_M, walk_scene
 from services.fusion.values import Located
-from services.navigator.autopilot.frames import Mount
 from services.simulator.scene import Scene
 
 SECONDS = 32.0

@@ -12,8 +12,8 @@ from services.slam.service import build as build_slam
 def build(context: Context) -> SlamService:
     """Start slam on the second camera's frames.
 
-    Only the motion from frame to frame is wanted: no loops, nothing on disk. The autopilot's attitude is not listened to:
-    slam takes it for that of a camera that looks ahead.
+    Only the motion from frame to frame is wanted: no loops, nothing on disk, and nobody asks whether this map is level: the
+    autopilot's attitude, which slam would turn by the first camera's mount, is not listened to.
 
     Raises:
         InputError: there is no second camera.

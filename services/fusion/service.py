@@ -13,10 +13,10 @@ from schemas.vehicle import GpsFix, ImuSamples
 from services.common.context import Context
 from services.common.errors import InputError
 from services.common.geometry import from_transform, to_transform
+from services.common.mount import Mount
 from services.fusion.fuser import Fuser
 from services.fusion.values import Fused, GpsReading, ImuReading, Located
 from services.inventory.geodesy import TangentPlane
-from services.navigator.autopilot.frames import Mount
 
 _TICK_S = 1.0 / 15.0
 _SILENT_S = 0.2

@@ -137,10 +137,11 @@ class DenseMap:
 
         A pose that is the same object as last time is known not to have changed.
         """
-        moved = []
-        for submap in self.submaps.values():
+        for submap in self.submaps.values():  # before any is placed: one graph may cull a keyframe and move the others
             if submap.anchor_id not in poses:
                 self._anchor_elsewhere(submap, poses)
+        moved = []
+        for submap in self.submaps.values():
             T = poses.get(submap.anchor_id)
             if T is None or T is submap.T_map_anchor:
                 continue

@@ -93,6 +93,9 @@ class MapperService:
         if keyframe.keyframe_id in self.map.submaps:
             self._context.health.count("repeated_keyframes")
             return
+        if keyframe.graph_version < self._graph_version and keyframe.keyframe_id not in self._poses:
+            self._context.health.count("culled_keyframes")  # it is told at the place that the graph has moved since
+            return
         try:
             depth_m, rgb, rays = self._images(keyframe)
         except FrameError as error:
@@ -104,7 +107,7 @@ class MapperService:
             cloud = keyframe_cloud(depth_m, rgb, rays, self._config)
         T = from_transform(keyframe.T_map_camera)
         if keyframe.graph_version < self._graph_version:
-            T = self._poses.get(keyframe.keyframe_id, T)
+            T = self._poses[keyframe.keyframe_id]
         self._graph_version = max(self._graph_version, keyframe.graph_version)
         self._context.health.count("keyframes")
         self._tell(self._add(keyframe, depth_m, rays, cloud, T), points=True)

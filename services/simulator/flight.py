@@ -33,7 +33,7 @@ from schemas.trees import Target
 from schemas.vehicle import VehicleState
 from services.common.context import Context
 from services.common.geometry import pose, rotation_z
-from services.navigator.autopilot.frames import Mount
+from services.common.mount import Mount
 from services.simulator.config import SimulatorConfig
 from services.simulator.followers import Follower, Followers
 from services.simulator.path import START_STAMP_NS

@@ -13,7 +13,8 @@ from schemas.topics import CAMERA_COMPRESSED, CAMERA_RGBD, SLAM_GRAPH, SLAM_KEYF
 from schemas.vehicle import VehicleState
 from services.camera.codecs import FrameError, decode_colour, decode_depth_raw, recode
 from services.common.context import Context
-from services.common.geometry import R_BODY_CAMERA, Matrix, rotation_from_quaternion, to_transform
+from services.common.geometry import Matrix, rotation_from_quaternion, to_transform
+from services.common.mount import Mount
 from services.common.state import user_state
 from services.slam.config import SlamConfig
 from services.slam.maps import LiveMaps, LockstepMap, Maps
@@ -60,7 +61,11 @@ class SlamService:
         self._maps = maps
         self._nodes = Nodes()
         self._intrinsics: Intrinsics | None = None
-        self._up_body: tuple[int, Matrix] | None = None
+        autopilot = context.config.autopilot
+        mount = Mount.level(autopilot.camera_offset_m, autopilot.camera_pitch_rad, autopilot.camera_yaw_rad)
+        self._R_body_camera = mount.T_body_camera[:3, :3]
+        self._up: tuple[int, Matrix] | None = None
+        """Stamp and (3,) of up in the camera, by the autopilot."""
         self._last_stamp_ns = -1
         self._idle_periods = 0
         self._polished = True
@@ -71,8 +76,9 @@ class SlamService:
         """Keep the autopilot's idea of up (its roll and pitch)."""
         if state.quaternion_map_body is None or not state.connected:
             return
-        up_camera = R_BODY_CAMERA.T @ rotation_from_quaternion(state.quaternion_map_body).T @ np.array([0.0, 0.0, 1.0])
-        self._up_body = (state.stamp_ns, up_camera)
+        up_body = rotation_from_quaternion(state.quaternion_map_body).T @ np.array([0.0, 0.0, 1.0])
+        up_camera = self._R_body_camera.T @ up_body
+        self._up = (state.stamp_ns, up_camera)
 
     def on_frame(self, frame: RgbdFrame) -> None:
         """Locate one frame; a bad one is dropped, counted and told."""
@@ -145,9 +151,9 @@ class SlamService:
         return self.slam
 
     def _attitude(self, stamp_ns: int) -> Matrix | None:
-        if self._up_body is None or abs(stamp_ns - self._up_body[0]) > _ATTITUDE_AGE_NS:
+        if self._up is None or abs(stamp_ns - self._up[0]) > _ATTITUDE_AGE_NS:
             return None
-        return self._up_body[1]
+        return self._up[1]
 
     def _publish(self, frame: RgbdFrame, result: TrackResult) -> None:
         """In lockstep what the pose rests on goes first; live the pose does not wait for a keyframe's compression."""

@@ -10,9 +10,10 @@ from pymavlink.dialects.v20 import common as mav
 from schemas.navigation import Guidance, Setpoint
 from schemas.slam import Pose
 from services.common.geometry import level_camera, to_transform
+from services.common.mount import Mount
 from services.navigator.autopilot.bridge import Bridge
 from services.navigator.autopilot.config import AutopilotConfig
-from services.navigator.autopilot.frames import Mount, quaternion_ned, to_ned
+from services.navigator.autopilot.frames import quaternion_ned, to_ned
 
 MS = 1_000_000
 SECOND = 1_000 * MS

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mav
 
 from services.common.geometry import exp_rotation, level_camera, pose, rotation_from_quaternion
+from services.common.mount import Mount
 from services.navigator.autopilot.bridge import timesync_answer
-from services.navigator.autopilot.frames import Mount, covariance_ned, quaternion_ned, rotation_map_body, to_ned
+from services.navigator.autopilot.frames import covariance_ned, quaternion_ned, rotation_map_body, to_ned
 from tests.unit.autopilot_rig import HOLD_MODE, LAND_MODE, MS, OFFBOARD_MODE, POSITION_MODE, SECOND, Rig
 
 # -- frames -------------------------------------------------------------------------------------------------------

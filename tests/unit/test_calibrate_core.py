@@ -178,7 +178,7 @@ def test_the_mounting_is_found_from_one_picture() -> None:
 
 
 def test_a_camera_that_looks_down_by_the_bridges_convention() -> None:
-    from services.navigator.autopilot.frames import Mount
+    from services.common.mount import Mount
 
     mount = Mount.level((0.1, 0.0, -0.05), pitch_rad=0.2, yaw_rad=0.3)
     found = Mounting(mount.T_body_camera)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from services.common.geometry import Matrix, inverse, log_rotation, pose
+from services.common.mount import Mount
 from services.fusion.config import FusionConfig, SecondCameraConfig
 from services.fusion.fuser import Fuser
 from services.fusion.inertial import Inertial
 from services.fusion.values import Fused, Located, adjoint, carried, relative
-from services.navigator.autopilot.frames import Mount
 from tests.unit.fusion_motion import FRAME_S, T_BODY_CAMERA, located, reading, stamp_ns, true_body
 
 PERIOD_S = 0.008

@@ -100,6 +100,30 @@ def test_culled_keyframe_follows_its_neighbour() -> None:
     assert system.mapper.map.submaps[2].T_map_submap == pytest.approx(moved @ inverse(AHEAD) @ before)
 
 
+def test_a_graph_that_culls_a_keyframe_and_moves_the_others_moves_its_submap_too() -> None:
+    """A closed loop is told with what its keyframe culled: both in one graph."""
+    system = _Listener()
+    at = {k: level_camera([0.3 * k, 0.0, 1.5], 0.4 * k) for k in range(1, 6)}
+    for k, T in at.items():
+        system.send(_keyframe(k, T))
+    system.send(_graph(2, at))
+    shifted = {k: level_camera([0.3 * k, 0.5, 1.5], 0.4 * k) for k in at if k != 3}
+    system.send(_graph(3, shifted))
+    assert {k: float(s.T_map_submap[1, 3]) for k, s in system.mapper.map.submaps.items()} == pytest.approx(
+        dict.fromkeys(at, 0.5)
+    )
+
+
+def test_a_keyframe_that_was_culled_before_it_came_is_not_mapped_at_its_old_place() -> None:
+    system = _Listener()
+    system.send(_keyframe(1, AHEAD))
+    system.send(_graph(2, {1: level_camera([0.0, 0.5, 1.5], 0.0)}))
+    assert system.send(_keyframe(2, AHEAD)) == [], "of graph 1, and graph 2 does not hold it"
+    assert system.mapper._context.health.counters["culled_keyframes"] == 1
+    late = _keyframe(3, AHEAD).model_copy(update={"graph_version": 3})
+    assert [submap.submap_id for submap in system.send(late)] == [3], "its graph comes after it"
+
+
 def test_a_new_map_withdraws_the_old() -> None:
     system = _Listener()
     system.send(_keyframe(1, AHEAD))

@@ -8,15 +8,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from schemas.camera import Intrinsics, RgbdFrame
 from schemas.codec import Wire, decode, encode
 from schemas.slam import Graph, Keyframe, Pose
-from schemas.topics import CAMERA_RGBD, SLAM_GRAPH, SLAM_KEYFRAME, SLAM_POSE
+from schemas.topics import CAMERA_RGBD, SLAM_GRAPH, SLAM_KEYFRAME, SLAM_POSE, VEHICLE_STATE
+from schemas.vehicle import VehicleState
 from services.camera.codecs import decode_depth
 from services.common.clock import SimulatedClock
 from services.common.config import TreedockConfig
+from services.common.geometry import from_transform
 from services.common.memory import Hub, MemoryContext
+from services.navigator.autopilot.config import AutopilotConfig
 from services.slam.config import SlamConfig
 from services.slam.service import build
 from tests.unit.slam_room import INTRINSICS, look, turn_on_the_spot
@@ -31,8 +35,10 @@ def frame(seq: int, intrinsics: Intrinsics = INTRINSICS) -> RgbdFrame:
     )  # fmt: skip
 
 
-def started() -> tuple[Hub, MemoryContext, MemoryContext, list[Wire]]:
-    hub = Hub(TreedockConfig(), SimulatedClock())
+def started(
+    autopilot: AutopilotConfig = AutopilotConfig(),  # noqa: B008
+) -> tuple[Hub, MemoryContext, MemoryContext, list[Wire]]:
+    hub = Hub(TreedockConfig(autopilot=autopilot), SimulatedClock())
     context = hub.context("slam")
     build(context)  # the protocol's clock is writable, so it wants exactly Clock
     said: list[Wire] = []
@@ -54,6 +60,26 @@ def test_keyframe_and_graph_come_before_the_pose_that_rests_on_them() -> None:
     assert pose.keyframe_id == keyframe.keyframe_id
     raw = decode_depth(keyframe.depth, "zstd", INTRINSICS.width, INTRINSICS.height)
     assert raw.tobytes() == bytes(frame(0).depth)
+
+
+@pytest.mark.parametrize(("pitch_rad", "yaw_rad"), [(0.0, 0.0), (0.35, 0.0), (0.1, 0.7)])
+def test_the_autopilots_level_is_turned_by_the_cameras_mount(pitch_rad: float, yaw_rad: float) -> None:
+    """The aircraft stands level: a camera that looks down on it by 20 degrees looks down in the map too."""
+    hub, _, camera, said = started(AutopilotConfig(camera_pitch_rad=pitch_rad, camera_yaw_rad=yaw_rad))
+    hub.context("autopilot").publish(VEHICLE_STATE, VehicleState(
+        stamp_ns=0, seq=0, connected=True, armed=False, mode="hold", landed="on_ground",
+        quaternion_map_body=(0.0, 0.0, 0.0, 1.0), position_map_m=None, velocity_map_m_s=None, battery_share=None,
+        vision_fused=False, operator_override=False, engaged_mission_id=0, link_age_s=0.0,
+    ))  # fmt: skip
+    camera.publish(CAMERA_RGBD, replace(frame(0), accel_camera=None))
+    hub.run()
+    pose = said[-1]
+    assert isinstance(pose, Pose)
+    assert pose.T_map_camera is not None
+    forward = from_transform(pose.T_map_camera)[:3, 2]
+    right = from_transform(pose.T_map_camera)[:3, 0]
+    assert np.arcsin(-forward[2]) == pytest.approx(pitch_rad, abs=1e-6)
+    assert right[2] == pytest.approx(0.0, abs=1e-6)
 
 
 def test_every_frame_has_a_pose_and_silence_polishes_the_map() -> None:

@@ -6,6 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 
+_NEAREST = 8
+"""So many depth images on each side are looked at: were all stamps alike, each would be as near as every other."""
+
+
 def associate(colour_ns: NDArray[np.int64], depth_ns: NDArray[np.int64], within_ns: int) -> list[tuple[int, int]]:
     """Pair colour and depth stamps: nearest first, each used once, none further apart than ``within_ns``.
 
@@ -21,7 +25,8 @@ def associate(colour_ns: NDArray[np.int64], depth_ns: NDArray[np.int64], within_
     ordered = depth_ns[order]
     candidates = []
     for i, stamp in enumerate(colour_ns):
-        first, last = np.searchsorted(ordered, [stamp - within_ns, stamp + within_ns + 1])
+        first, here, last = np.searchsorted(ordered, [stamp - within_ns, stamp, stamp + within_ns + 1])
+        first, last = max(first, here - _NEAREST), min(last, here + _NEAREST)
         candidates += [(abs(int(ordered[k]) - int(stamp)), int(stamp), i, int(order[k])) for k in range(first, last)]
     used_colour: set[int] = set()
     used_depth: set[int] = set()
@@ -38,7 +43,10 @@ def unpaired(colour_ns: NDArray[np.int64], depth_ns: NDArray[np.int64], within_n
     """Return why not one colour image has its depth image, with the usual distance between the two."""
     if not len(colour_ns) or not len(depth_ns):
         return f"{len(colour_ns)} colour and {len(depth_ns)} depth images"
-    apart_ms = float(np.median(np.abs(colour_ns[:, None] - depth_ns[None, :]).min(axis=1))) / 1e6
+    ordered = np.sort(depth_ns)
+    after = np.searchsorted(ordered, colour_ns)
+    beside = (ordered[np.maximum(after - 1, 0)], ordered[np.minimum(after, len(ordered) - 1)])
+    apart_ms = float(np.median(np.minimum(*(np.abs(colour_ns - near) for near in beside)))) / 1e6
     return (
         f"no colour image has a depth image within {within_ns / 1e6:.0f} ms; the nearest is usually {apart_ms:.0f} ms "
         "away: are the stamps of one of the two shifted? (camera.associate_within_s)"

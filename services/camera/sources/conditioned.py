@@ -11,6 +11,7 @@ from services.camera.conditioning import Conditioner
 from services.camera.config import CameraConfig
 from services.camera.plausible import DepthScaleWatch
 from services.camera.sources.base import BadFrame, Source
+from services.camera.sources.strays import without_strays
 from services.camera.watch import StreamWatch, fingerprint
 
 
@@ -31,7 +32,7 @@ class ConditionedSource:
 
     def __iter__(self) -> Iterator[RgbdFrame | BadFrame]:
         """Yield the source's frames, conditioned."""
-        for item in self._source:
+        for item in without_strays(self._source):
             yield self._conditioned(item) if isinstance(item, RgbdFrame) else item
 
     def note(self) -> str:

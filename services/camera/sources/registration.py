@@ -24,9 +24,12 @@ class Registration:
         self._colour = colour
         self._T = np.ascontiguousarray(T_colour_depth)
 
-    def apply(self, depth_raw: NDArray[np.uint16]) -> NDArray[np.uint16]:
-        """Return (H, W) of the colour camera, in the colour camera's ``depth_scale``; zero where there is no data."""
-        depth_m = depth_raw.astype(np.float32) / np.float32(self.camera.depth_scale)
+    def apply(self, depth_raw: NDArray[np.uint16], depth_scale: float | None = None) -> NDArray[np.uint16]:
+        """Return (H, W) of the colour camera, in the colour camera's ``depth_scale``; zero where there is no data.
+
+        ``depth_scale``: units per metre of ``depth_raw`` where the image itself tells them; else the depth camera's.
+        """
+        depth_m = depth_raw.astype(np.float32) / np.float32(depth_scale or self.camera.depth_scale)
         moved_m = register(depth_m, self.camera, self._colour, self._T)
         return np.minimum(np.rint(moved_m * np.float32(self._colour.depth_scale)), _LARGEST).astype(np.uint16)
 

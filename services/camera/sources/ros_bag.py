@@ -75,6 +75,8 @@ class BagSource:
             self.topics = choose_topics(reader, path, config)
             stamps = _stamps(reader, self.topics)
             colour_ns, depth_ns = (np.array(stamps[t], dtype=np.int64) for t in (self.topics.colour, self.topics.depth))
+            for topic, stamps_ns in ((self.topics.colour, colour_ns), (self.topics.depth, depth_ns)):
+                _refuse_repeated(path, topic, stamps_ns)
             self._pairs = dict(associate(colour_ns, depth_ns, within_ns))
             if not self._pairs:
                 raise InputError(f"{path}: no frames: {unpaired(colour_ns, depth_ns, within_ns)}")
@@ -120,7 +122,7 @@ class BagSource:
         except FrameError as error:
             return BadFrame(stamp_ns, f"{self._path}: frame {number}: {error}")
         if registration is not None:
-            raw, scale = registration.apply(raw), camera.depth_scale
+            raw, scale = registration.apply(raw, scale), camera.depth_scale
         if scale != camera.depth_scale:
             camera = self.intrinsics = camera.model_copy(update={"depth_scale": scale})
         return RgbdFrame(
@@ -164,6 +166,15 @@ def choose_topics(reader: AnyReader, path: Path, config: CameraConfig) -> Topics
         chosen[kind] = min(found, key=_depth_rank if kind == "depth" else _colour_rank)
     infos = sorted(c.topic for c in reader.connections if c.msgtype == _INFO and c.msgcount)
     return Topics(chosen["colour"], chosen["depth"], _info_for(chosen["colour"], infos))
+
+
+def _refuse_repeated(path: Path, topic: str, stamps_ns: NDArray[np.int64]) -> None:
+    values, counts = np.unique(stamps_ns, return_counts=True)
+    if len(counts) and counts.max() > 1 and counts.max() > _ALONE_SHARE * len(stamps_ns):
+        raise InputError(
+            f"{path}: {topic}: {counts.max()} of {len(stamps_ns)} images have the header stamp "
+            f"{values[counts.argmax()] * 1e-9:.3f} s: the driver does not fill it in, so no image can be paired by it"
+        )
 
 
 def _left_out(colours: int, pairs: int, within_ns: int) -> str:

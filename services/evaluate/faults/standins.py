@@ -37,11 +37,11 @@ from services.cli.service_command import end_with
 from services.common.config import load_config
 from services.common.context import Context
 from services.common.geometry import from_transform, inverse, to_transform
+from services.common.mount import Mount
 from services.common.process import prepare_process
 from services.common.runtime import run_service
 from services.common.stop import end_process
 from services.evaluate.synthetic import ChainErrors, SyntheticChain, TrueTrunk
-from services.navigator.autopilot.frames import Mount
 
 M = TypeVar("M", Pose, Target, TreeList)
 

@@ -15,12 +15,13 @@ from schemas.navigation import Guidance
 from schemas.slam import Pose
 from schemas.vehicle import VehicleState
 from services.common.geometry import Matrix, wrap_angle
+from services.common.mount import Mount
 from services.navigator.autopilot import px4
 from services.navigator.autopilot.clock_check import ClockCheck
 from services.navigator.autopilot.config import AutopilotConfig
 from services.navigator.autopilot.engagement import Engagement, Order, Vehicle
 from services.navigator.autopilot.foreign import Foreign
-from services.navigator.autopilot.frames import Mount, to_ned
+from services.navigator.autopilot.frames import to_ned
 from services.navigator.autopilot.parameters import ParameterReader, refusals
 from services.navigator.autopilot.sensors import Sensors
 from services.navigator.autopilot.telemetry import Telemetry

@@ -11,8 +11,9 @@ from pymavlink.dialects.v20 import common as mav
 
 from schemas.slam import Pose
 from services.common.geometry import Matrix
+from services.common.mount import Mount
 from services.navigator.autopilot.config import AutopilotConfig
-from services.navigator.autopilot.frames import D, Mount, covariance_ned, quaternion_ned, to_ned
+from services.navigator.autopilot.frames import D, covariance_ned, quaternion_ned, to_ned
 from services.navigator.track import PoseTrack, Step
 
 _ACCEL_SIGMA_M_S2 = 0.5
