@@ -11,6 +11,7 @@ from services.camera.codecs import FrameError, recode
 from services.camera.conditioning import Conditioner
 from services.camera.config import CameraConfig
 from services.camera.sources import BadFrame, ConditionedSource, open_source
+from services.camera.sources.strays import JUMP_NS
 from services.camera.warm import warm
 from services.camera.watch import StreamWatch
 from services.common.clock import on_clock_ns

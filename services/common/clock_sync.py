@@ -40,14 +40,13 @@ class Asker(Protocol):
 
 
 class ClockSync:
-    """Measures and corrects. ``stepped(by_ns)`` is called when the time jumps; in the sync's thread after the start."""
+    """Measures and corrects."""
 
     def __init__(
-        self, service: str, wall: WallClock, asker: Asker, stepped: Callable[[int], None],
-        monotonic_s: Callable[[], float] = time.monotonic,
-    ) -> None:  # fmt: skip
+        self, service: str, wall: WallClock, asker: Asker, monotonic_s: Callable[[], float] = time.monotonic
+    ) -> None:
         self._request = ClockRequest(sender=service)
-        self._wall, self._asker, self._stepped, self._monotonic_s = wall, asker, stepped, monotonic_s
+        self._wall, self._asker, self._monotonic_s = wall, asker, monotonic_s
         self._filter = OffsetFilter()
         self._begun_s = monotonic_s()
         self._measured = False
@@ -111,5 +110,3 @@ class ClockSync:
         step_ns = self._wall.correct(offset_ns, at_once=at_once)
         if abs(step_ns) > FAR_NS:
             LOG.warning("this machine's clock is %+.0f ms off the router's: corrected", -offset_ns * 1e-6)
-        if step_ns:
-            self._stepped(step_ns)

@@ -67,8 +67,6 @@ class LiveContext:
         self.at_stop: list[Callable[[], None]] = []
         self._timers: list[_Timer] = []
         self._wall_timers: list[_Timer] = []
-        self._stepped_ns = 0
-        """By how much the wall clock stepped since the timers were set."""
         self._throttle = Throttle()
         self._asking: Asking | None = None
 
@@ -81,15 +79,15 @@ class LiveContext:
 
     def every(self, period_s: float, handler: Callable[[], None]) -> None:
         """Call ``handler()`` each ``period_s`` of the clock's time; first after one period."""
-        self._add_timer(self._timers, self.clock, period_s, handler)
+        _add_timer(self._timers, self._timer_ns(), period_s, handler)
 
     def every_wall(self, period_s: float, handler: Callable[[], None]) -> None:
         """Call ``handler()`` each ``period_s`` of real time."""
-        self._add_timer(self._wall_timers, self.wall, period_s, handler)
+        _add_timer(self._wall_timers, time.monotonic_ns(), period_s, handler)
 
-    def _add_timer(self, timers: list[_Timer], clock: Clock, period_s: float, handler: Callable[[], None]) -> None:
-        period_ns = round(period_s * 1e9)
-        heapq.heappush(timers, _Timer(clock.now_ns() + period_ns, len(timers), period_ns, handler))
+    def _timer_ns(self) -> int:
+        """Return what timers count by: never the wall clock, which is corrected in steps."""
+        return self.clock.now_ns() if self.clock.simulated else time.monotonic_ns()
 
     def on_stop(self, handler: Callable[[], None]) -> None:
         """Call ``handler()`` before the bus closes."""
@@ -153,9 +151,7 @@ class LiveContext:
 
     def turn(self) -> None:
         """Fire what is due, handle the item that waited longest, or wait for the next thing to do."""
-        if self._stepped_ns:
-            self._move_timers()
-        fired = self._fire(self._wall_timers, self.wall) + self._fire(self._timers, self.clock)
+        fired = _fire(self._wall_timers, time.monotonic_ns()) + _fire(self._timers, self._timer_ns())
         taken = self.inbox.take()
         if taken is not None:
             box, item = taken
@@ -163,34 +159,13 @@ class LiveContext:
         elif not fired:
             self.inbox.wait(self._wait_s())
 
-    def _fire(self, timers: list[_Timer], clock: Clock) -> int:
-        """Fire each due timer at most once, so that samples get their turn in between."""
-        fired, now_ns = 0, clock.now_ns()
-        while timers and timers[0].due_ns <= now_ns:
-            timer = timers[0]
-            timer.advance(now_ns)
-            heapq.heapreplace(timers, timer)
-            timer.handler()
-            fired += 1
-        return fired
-
     def _wait_s(self) -> float:
         waits = [_LONGEST_WAIT_S]
         if self._wall_timers:
-            waits.append((self._wall_timers[0].due_ns - self.wall.now_ns()) * 1e-9)
+            waits.append((self._wall_timers[0].due_ns - time.monotonic_ns()) * 1e-9)
         if self._timers and not self.clock.simulated:
-            waits.append((self._timers[0].due_ns - self.clock.now_ns()) * 1e-9)
+            waits.append((self._timers[0].due_ns - time.monotonic_ns()) * 1e-9)
         return max(0.0, min(waits))
-
-    def wall_stepped(self, by_ns: int) -> None:
-        """Take note, from any thread, that the wall clock was corrected in one step: what was due in 50 ms still is."""
-        self._stepped_ns += by_ns
-        self.inbox.wake()
-
-    def _move_timers(self) -> None:
-        by_ns, self._stepped_ns = self._stepped_ns, 0
-        for timer in (*self._wall_timers, *(() if self.clock.simulated else self._timers)):
-            timer.due_ns += by_ns
 
     def follow_simulated_clock(self) -> None:
         """Let ``sim/clock`` set the clock, on Zenoh's thread: time also moves while a handler works."""
@@ -204,3 +179,20 @@ class LiveContext:
                 self.inbox.wake()
 
         self.bus.subscribe_keys(SIM_CLOCK, moved, at_once=True)
+
+
+def _add_timer(timers: list[_Timer], now_ns: int, period_s: float, handler: Callable[[], None]) -> None:
+    period_ns = round(period_s * 1e9)
+    heapq.heappush(timers, _Timer(now_ns + period_ns, len(timers), period_ns, handler))
+
+
+def _fire(timers: list[_Timer], now_ns: int) -> int:
+    """Fire each due timer at most once, so that samples get their turn in between."""
+    fired = 0
+    while timers and timers[0].due_ns <= now_ns:
+        timer = timers[0]
+        timer.advance(now_ns)
+        heapq.heapreplace(timers, timer)
+        timer.handler()
+        fired += 1
+    return fired

@@ -22,6 +22,9 @@ A = TypeVar("A", bound=Wire)
 
 Handler = Callable[[Any], None]
 
+_FELT_NS = 300_000_000_000
+"""Of a gap between two stamps, so much is lived through timer by timer."""
+
 
 @dataclass
 class _Timer:

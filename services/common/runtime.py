@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import datetime as dt
 import logging
+import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 
@@ -81,7 +82,7 @@ def _serve(context: LiveContext, build: Build, stop: StopSignal) -> int:
 
     def report(state: State | None = None) -> None:
         nonlocal reported_ns, wall_reported_ns
-        reported_ns, wall_reported_ns = context.clock.now_ns(), context.wall.now_ns()
+        reported_ns, wall_reported_ns = context.clock.now_ns(), time.monotonic_ns()
         waiting = overdue.update() if overdue else ""
         context.bus.count_overflows()
         tell(context.wall, context.health)
@@ -94,7 +95,7 @@ def _serve(context: LiveContext, build: Build, stop: StopSignal) -> int:
 
     def report_by_the_wall() -> None:
         # rates over a moment say nothing: not right after the simulation's own second
-        if not context.clock.simulated or context.wall.now_ns() - wall_reported_ns >= _HEALTH_PERIOD_NS // 2:
+        if not context.clock.simulated or time.monotonic_ns() - wall_reported_ns >= _HEALTH_PERIOD_NS // 2:
             report()
 
     def report_if_due() -> None:
@@ -103,7 +104,7 @@ def _serve(context: LiveContext, build: Build, stop: StopSignal) -> int:
 
     expiry = Expiry(context.config.security, context.uav, context.service)
     if context.service != "router":
-        sync = ClockSync(context.service, context.wall, context.bus, context.wall_stepped)
+        sync = ClockSync(context.service, context.wall, context.bus)
         sync.begin()
         sync.keep(lambda: stop.is_set)
     report("starting")

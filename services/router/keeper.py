@@ -7,7 +7,6 @@ outlived it still share the time of the one before. So it believes the first of 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 
 from schemas.health import Health
 from schemas.timekeeping import ClockReply, ClockRequest
@@ -27,8 +26,8 @@ _OLDER_S = 1.0
 class TimeKeeper:
     """Answers ``clock``; follows the elder services right after its own start."""
 
-    def __init__(self, context: Context, wall: WallClock, stepped: Callable[[int], None]) -> None:
-        self._wall, self._stepped = wall, stepped
+    def __init__(self, context: Context, wall: WallClock) -> None:
+        self._wall = wall
         self._begun_ns = wall.machine_ns()
         self._taken_up = False
         context.answer(CLOCK, ClockRequest, lambda _: ClockReply(stamp_ns=wall.now_ns()))
@@ -42,5 +41,5 @@ class TimeKeeper:
         self._taken_up = True
         off_ns = health.stamp_ns - self._wall.now_ns()
         if abs(off_ns) > FAR_NS:  # less is the way of the message
-            self._stepped(self._wall.correct(self._wall.correction_ns + off_ns, at_once=True))
+            self._wall.correct(self._wall.correction_ns + off_ns, at_once=True)
             LOG.warning("the clock of %s goes on: this machine's is %+.0f ms off it", health.service, -off_ns * 1e-6)

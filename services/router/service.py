@@ -59,6 +59,6 @@ def run(config: TreedockConfig, stop: StopSignal | None = None) -> int:
 
     def build(context: LiveContext) -> None:
         watch.register(context)
-        TimeKeeper(context, context.wall, context.wall_stepped)
+        TimeKeeper(context, context.wall)
 
     return run_service("router", build, config, stop, session=lambda _: listening(config))

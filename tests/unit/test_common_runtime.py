@@ -57,6 +57,22 @@ def test_wall_timers_go_on_while_simulated_time_stands_still() -> None:
     assert len(fired) == 3
 
 
+@pytest.mark.parametrize("off_s", [-3600.0, 60.0])
+def test_timers_do_not_mind_that_the_wall_clock_is_corrected(off_s: float) -> None:
+    """Before they are set (a service starts on a machine whose clock is off) and after."""
+    context = live()
+    context.wall.correct(round(off_s * 1e9), at_once=True)
+    fired: list[str] = []
+    context.every(0.02, lambda: fired.append("clock"))
+    context.every_wall(0.02, lambda: fired.append("wall"))
+    context.wall.correct(round(-off_s * 1e9), at_once=True)
+    end_s = time.monotonic() + 5.0
+    while not {"clock", "wall"} <= set(fired) and time.monotonic() < end_s:
+        context.turn()
+    assert {"clock", "wall"} <= set(fired)
+    assert len(fired) < 20, "nor is anything made up for"
+
+
 def test_refused_data_is_counted_and_a_bug_is_not_hidden() -> None:
     context = live()
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-
 _NEAREST = 8
 """So many depth images on each side are looked at: were all stamps alike, each would be as near as every other."""
 

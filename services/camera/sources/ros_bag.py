@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from schemas.camera import Intrinsics, RgbdFrame, depth_after
 from services.camera.codecs import FrameError, encode_colour, encode_depth
