@@ -55,6 +55,28 @@ def test_a_single_file_of_a_ros2_bag_opens_too(tmp_path: Path, mcap: bool) -> No
     assert len(frames_of(file)) == 4
 
 
+def test_metres_of_a_depth_camera_of_its_own_stay_metres(tmp_path: Path) -> None:
+    """An image of metres tells its own unit: the depth camera's file has millimetres, as calibrate writes."""
+    here = {**CAMERA, "depth_scale": 1000.0}
+    (tmp_path / "depth.json").write_text(json.dumps({**here, "T_colour_depth": np.eye(4).tolist()}))
+    (tmp_path / "colour.json").write_text(json.dumps(here))
+    config = CONFIG.model_copy(
+        update={"depth_camera_file": str(tmp_path / "depth.json"), "camera_file": str(tmp_path / "colour.json")}
+    )
+    for k, each in enumerate(frames_of(written(tmp_path, form="float"), config)):
+        assert np.abs(decode_depth_m(each) - depth_mm(k) / 1000.0).max() < 2e-3
+
+
+def test_images_without_header_stamps_are_refused_with_the_topic(tmp_path: Path) -> None:
+    maker = BagMaker(2)
+    messages = camera_messages(maker, 6)
+    for topic, _, message in messages:
+        if topic == DEPTH:
+            message.header.stamp = maker.header(0).stamp
+    with pytest.raises(InputError, match=f"{DEPTH}: 6 of 6 images have the header stamp 0.000 s: the driver"):
+        open_recording(maker.write(tmp_path / "a", messages), CONFIG)
+
+
 def test_the_source_can_be_named(tmp_path: Path) -> None:
     assert open_source(f"bag:{written(tmp_path, 1)}", CONFIG).expected == 4
     with pytest.raises(InputError, match="no such file"):

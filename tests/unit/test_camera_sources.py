@@ -4,6 +4,7 @@ import builtins
 import dataclasses
 import json
 import os
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from services.camera.codecs import decode_colour, decode_depth_raw
 from services.camera.config import CameraConfig
 from services.camera.depth.config import DepthConfig
 from services.camera.sources import BadFrame, open_recording, open_source
-from services.camera.sources.associate import associate
+from services.camera.sources.associate import associate, unpaired
 from services.camera.sources.mcap_file import FrameWriter, McapSource
 from services.camera.sources.tum import TumSource
 from services.common.errors import InputError
@@ -119,6 +120,19 @@ def test_pairs_of_two_moments_are_told(tmp_path: Path, shift_ms: int, told: bool
     assert len(list(source)) == 6
     assert ("6 of 6 frames pair colour with depth of another time" in source.total()) == told
     assert not told or f"{shift_ms + 7:+d} ms" in source.total()
+
+
+def test_an_hour_of_shifted_or_equal_stamps_needs_little_memory() -> None:
+    colour_ns = np.arange(100_000, dtype=np.int64) * 33_333_333
+    tracemalloc.start()
+    try:
+        assert associate(colour_ns, colour_ns + 10_000_000, 5_000_000) == []
+        assert "usually 10 ms away" in unpaired(colour_ns, colour_ns + 10_000_000, 5_000_000)
+        equal = np.zeros(20_000, dtype=np.int64)
+        assert len(associate(equal, equal, 5_000_000)) <= 16
+        assert tracemalloc.get_traced_memory()[1] < 100e6
+    finally:
+        tracemalloc.stop()
 
 
 def test_lists_whose_stamps_are_shifted_say_by_how_much(tmp_path: Path) -> None:

@@ -9,6 +9,8 @@ from services.camera.sources.base import BadFrame
 
 JUMP_NS = 60_000_000_000
 """Stamps that differ by more are not of one stretch of frames: the recording paused, a clock was set, or a stamp is wrong."""
+_WAIT_FOR = 10
+"""A frame that waits for its next lets no more bad ones wait behind it: a broken camera must be told."""
 
 
 def without_strays(frames: Iterable[RgbdFrame | BadFrame]) -> Iterator[RgbdFrame | BadFrame]:
@@ -19,17 +21,23 @@ def without_strays(frames: Iterable[RgbdFrame | BadFrame]) -> Iterator[RgbdFrame
     """
     last_ns: int | None = None
     held: RgbdFrame | None = None
+    behind: list[BadFrame] = []
     for item in frames:
         if isinstance(item, BadFrame):
-            yield item
+            behind.append(item)
+            if held is None or len(behind) > _WAIT_FOR:
+                if held is not None:
+                    yield held
+                    last_ns = held.stamp_ns
+                yield from behind
+                held, behind = None, []
             continue
         if held is not None:
-            if _stray(held.stamp_ns, last_ns, item.stamp_ns):
-                yield _told(held, item, last_ns)
-            else:
-                yield held
-                last_ns = held.stamp_ns
-            held = None
+            stray = _stray(held.stamp_ns, last_ns, item.stamp_ns)
+            yield _told(held, item, last_ns) if stray else held
+            yield from behind
+            last_ns = last_ns if stray else held.stamp_ns
+            held, behind = None, []
         if last_ns is None or item.stamp_ns - last_ns > JUMP_NS:
             held = item
             continue
@@ -37,6 +45,7 @@ def without_strays(frames: Iterable[RgbdFrame | BadFrame]) -> Iterator[RgbdFrame
         last_ns = max(last_ns, item.stamp_ns)
     if held is not None:
         yield held
+        yield from behind
 
 
 def _stray(held_ns: int, last_ns: int | None, next_ns: int) -> bool:
