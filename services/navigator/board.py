@@ -272,6 +272,10 @@ class Board:
         self.docked_count += int(visited)
         self.claims.done |= visited
 
+    def further_tree(self) -> None:
+        """Want one more tree than were done, instead of the way home."""
+        self.trees_wanted, self.homeward, self.giving_way = max(self.trees_wanted, self.docked_count + 1), False, False
+
     def drop_target(self) -> None:
         """Have no target any more."""
         self.target_id, self.axis_m, self.dock_direction, self.target_seen_ns = None, None, None, None

@@ -109,6 +109,8 @@ class FailsafeConfig(BaseModel):
     battery_land_share: float = Field(default=0.20, ge=0.0, le=1.0)
     battery_next_share: float = Field(default=0.30, ge=0.0, le=1.0)
     """Below this no further tree is begun: return and land."""
+    view_silent_s: float = Field(default=0.5, gt=0.0, le=5.0)
+    """The live guard is blind when no depth image came for so long: nothing is flown at that it has not looked at."""
     obstacle_hold_s: float = Field(default=10.0, gt=0.0, le=300.0)
     restart_hold_s: float = Field(default=5.0, gt=0.0, le=60.0)
     operator_hold_s: float = Field(default=180.0, gt=0.0, le=3600.0)

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from schemas.navigation import MissionStateName
+from schemas.vehicle import VehicleState
 from services.navigator.board import Board
 from services.navigator.obstacles import GUARDED, MOVING_M_S, Block, braking_m
 from services.navigator.track import Step
@@ -78,7 +79,7 @@ class Watch:
         if v is not None and v.engaged_mission_id == self.mission_id:
             self.engaged = True
             self.armed |= v.armed and v.mode == "offboard"
-        self.ground_seen |= "station" in b.inputs.services
+        self.ground_seen |= b.inputs.service_age_s("station") <= b.config.failsafe.ground_silent_s
         self._remember_jump(b)
 
     def _remember_jump(self, b: Board) -> None:
@@ -101,15 +102,20 @@ def _operator(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
     v = b.vehicle
     if v is None:
         return None
-    if v.operator_override:
+    if v.operator_override and v.engaged_mission_id == w.mission_id:  # an earlier mission's stands until ours engages
         return Fault("operator", "release", f"operator took over: {v.note or v.mode}; we are silent")
     if not w.armed or doing == "landing":
         return None
     if not v.armed:
-        return Fault("operator", "release", "disarmed, not by us; we are silent")
+        return Fault("operator", "release", f"disarmed, not by us{_bridge_says(v)}; we are silent")
     if v.mode != "offboard":
-        return Fault("operator", "release", f"mode {v.mode}, not by us; we are silent")
+        return Fault("operator", "release", f"mode {v.mode}, not by us{_bridge_says(v)}; we are silent")
     return None
+
+
+def _bridge_says(v: VehicleState) -> str:
+    """Return the bridge's own word: it may have landed the aircraft, or never have flown it."""
+    return f" ({v.note})" if v.note else ""
 
 
 def _bridge_restarted(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
@@ -213,6 +219,18 @@ def _trees(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
     return Fault("trees stale", "hold", "the list of trees is old", f.trees_hold_s)
 
 
+def _eyes(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
+    """Stop where the live guard has nothing to look at: without images every way looks free."""
+    del w
+    f = b.config.failsafe
+    if doing not in GUARDED or not b.config.live_guard or b.config.handheld:
+        return None
+    age_s = b.inputs.age_s(b.inputs.view)
+    if age_s <= f.view_silent_s:
+        return None
+    return Fault("guard blind", "hold", "the live guard gets no depth images", f.obstacle_hold_s)
+
+
 def _obstacle(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
     here, velocity = b.here, b.trajectory.velocity_m_s[:2]
     if here is None:
@@ -257,5 +275,5 @@ def _claim(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
 
 _DETECTORS: tuple[Callable[[Watch, Board, MissionStateName], Fault | None], ...] = (
     _operator, _bridge_restarted, _vehicle_link, _battery, _geofence, _slam, _pose_jump, _services, _target, _trees,
-    _obstacle, _unseen, _claim, _ground_link,
+    _eyes, _obstacle, _unseen, _claim, _ground_link,
 )  # fmt: skip

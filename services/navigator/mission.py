@@ -51,6 +51,8 @@ class Mission:
         self._hold_limit_s = 0.0
         self._resume: MissionStateName = "idle"
         self._clear_since_ns: int | None = None
+        self._fault_name, self._fault_since_ns = "", 0
+        """The failsafe in force, and since when without a break."""
         self._events: list[Event] = []
         self._seq = 0
 
@@ -118,6 +120,7 @@ class Mission:
     def _answer(self, now_ns: int) -> None:
         """Do what the fault in force asks for."""
         fault = self.fault
+        self._time_fault(fault, now_ns)
         if fault is None:
             if self.state == "hold":
                 self._wait_in_hold(now_ns)
@@ -131,8 +134,19 @@ class Mission:
             self.go(Next("landing", fault.word), now_ns)
         elif self.state != "hold":
             self.hold(fault, "fault", now_ns)
-        elif self._held_s(now_ns) > min(self._hold_limit_s, fault.hold_s):
-            self._give_up_hold(fault.word, now_ns)
+        else:
+            if self._hold_cause == "fault":  # another fault in the same hold: it has its own time
+                self._hold_limit_s = max(self._hold_limit_s, fault.hold_s)
+            if self._held_s(now_ns) > self._hold_limit_s or self._fault_s(now_ns) > fault.hold_s:
+                self._give_up_hold(fault.word, now_ns)
+
+    def _time_fault(self, fault: Fault | None, now_ns: int) -> None:
+        name = fault.name if fault is not None else ""
+        if name != self._fault_name:
+            self._fault_name, self._fault_since_ns = name, now_ns
+
+    def _fault_s(self, now_ns: int) -> float:
+        return (now_ns - self._fault_since_ns) / 1e9
 
     def _wait_in_hold(self, now_ns: int) -> None:
         if self._clear_since_ns is None:
@@ -164,13 +178,23 @@ class Mission:
         self._hold_cause, self._hold_limit_s, self._clear_since_ns = cause, fault.hold_s, None
         self.go(Next("hold", fault.word), now_ns)
 
+    def choose_after_hold(self) -> None:
+        """Let what follows this hold choose a tree anew, away from the trunk first where the aircraft is at one."""
+        b = self.board
+        if self._resume in ("face", "approach"):
+            b.drop_target()
+            self._resume = "select"
+        elif self._resume in ("dock", "docked", "undock", "return"):
+            b.further_tree()
+            self._resume = "select" if self._resume == "return" else "undock"
+
     def leave_hold(self, reason: str, now_ns: int) -> None:
         """Go on with what the hold interrupted, as far as that is still possible."""
         target = _RESUME.get(self._resume, self._resume)
         if target in ("face", "approach", "docked", "undock") and self.board.axis_m is None:
             target = "select"
-        if self.board.map_changed and target != "take_off":
-            self.board.map_changed = False
+        changed, self.board.map_changed = self.board.map_changed, False
+        if changed and target != "take_off":
             done = self.board.docked_count >= self.board.trees_wanted
             target, reason = ("landing" if done else "scan"), f"{reason}; in a new map"
         if self.board.trajectory.fence is None:
@@ -232,6 +256,8 @@ class Mission:
         self.board.home_m = here.position_m.copy()
         if self._hold_cause == "restart":  # adopted in flight: the map's origin is the start
             self.board.home_m = np.zeros(3)
+        else:  # whatever became of the map before, here is the start
+            self.board.home_known, self.board.map_changed = True, False
         home = self.board.home_m
         height = m.fence_height_m + _FLOOR_M
         self.board.trajectory.fence = Fence(home.copy(), float(home[2]) - _FLOOR_M, m.fence_radius_m, height)

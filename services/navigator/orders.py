@@ -53,19 +53,23 @@ def _start(m: Mission, now_ns: int) -> Verdict:
 
 
 def _hold(m: Mission, now_ns: int) -> Verdict:
-    if m.state == "preflight":
-        return _no("still on the ground: abort instead")
+    if _on_ground(m):  # it would arm and then hold in the air: whoever says hold wants nothing to happen
+        return _come_down(m, "hold", now_ns)
     limit_s = m.config.failsafe.operator_hold_s
     m.hold(Fault("", "hold", "the operator said hold", limit_s), "operator", now_ns)
     return _yes("holding")
 
 
 def _come_down(m: Mission, name: str, now_ns: int) -> Verdict:
-    if m.state == "preflight" or (m.state == "take_off" and not m.watch.armed):
+    if _on_ground(m):
         m.go(Next("landed", f"{name} ordered before take-off"), now_ns)
     else:
         m.go(Next("landing", f"{name} ordered"), now_ns)
     return _yes(m.reason)
+
+
+def _on_ground(m: Mission) -> bool:
+    return m.state == "preflight" or (m.state == "take_off" and not m.watch.armed)
 
 
 def _resume(m: Mission, now_ns: int) -> Verdict:
@@ -92,8 +96,15 @@ def _choose(m: Mission, tree_id: int | None, now_ns: int) -> Verdict:
         b.drop_target()
         m.go(Next("select", f"the operator chose tree {tree_id}"), now_ns)
     elif m.state in ("dock", "docked"):
-        b.trees_wanted = max(b.trees_wanted, b.docked_count + 1)
+        b.further_tree()
         m.go(Next("undock", f"the operator chose tree {tree_id}"), now_ns)
+    elif m.state == "undock":
+        b.further_tree()
+    elif m.state == "return" and not b.giving_way:
+        b.further_tree()
+        m.go(Next("select", f"the operator chose tree {tree_id}"), now_ns)
+    elif m.state == "hold":
+        m.choose_after_hold()
     return _yes(f"tree {tree_id} is next")
 
 

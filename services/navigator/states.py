@@ -128,6 +128,8 @@ def select(b: Board, since_s: float) -> Result:
     if here is None or since_s < c.select_settle_s:
         return Intent("stop")
     done = {*b.visited_ids, *b.given_up_ids}
+    if done and (low := _too_low_for_another(b)):
+        return _go_home(b, low)
     b.claims.wait_only_for({t.id for t in b.trees} - done)
     closed = done | b.claims.closed_ids
     choice = choose(b.trees, here.position_m, closed, b.done_xy_m, c.select_confidence, b.wanted_id)
@@ -218,9 +220,8 @@ def docked(b: Board, since_s: float) -> Result:
     """Entry: docked. Exit: after dock.hold_s, more trees wanted -> undock; else return or landing."""
     seen = b.to_axis()
     if since_s >= b.config.dock.hold_s:
-        share = None if b.vehicle is None else b.vehicle.battery_share
-        if b.docked_count < b.trees_wanted and share is not None and share < b.config.failsafe.battery_next_share:
-            return _go_home(b, f"battery at {100.0 * share:.0f} %: no further tree")
+        if b.docked_count < b.trees_wanted and (low := _too_low_for_another(b)):
+            return _go_home(b, low)
         if b.docked_count < b.trees_wanted:
             return Next("undock", f"{b.docked_count} of {b.trees_wanted} trees done")
         return _go_home(b, f"{b.docked_count} of {b.trees_wanted} trees done")
@@ -290,6 +291,12 @@ STATES: dict[MissionStateName, Callable[[Board, float], Result]] = {
     "take_off": take_off, "scan": scan, "select": select, "face": face, "approach": approach, "dock": dock,
     "docked": docked, "undock": undock, "return": return_home,
 }  # fmt: skip
+
+
+def _too_low_for_another(b: Board) -> str:
+    share = None if b.vehicle is None else b.vehicle.battery_share
+    low = share is not None and share < b.config.failsafe.battery_next_share
+    return f"battery at {100.0 * share:.0f} %: no further tree" if share is not None and low else ""
 
 
 def _go_home(b: Board, reason: str) -> Next:

@@ -3,6 +3,8 @@ that take each of them away."""
 
 from __future__ import annotations
 
+import copy
+import functools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -48,6 +50,8 @@ class World:
     spent_id: int = 0
     """The highest mission that was ever engaged; a bridge that was restarted does not know it, and engages none anew."""
     override: bool = False
+    note: str = ""
+    """The bridge's word."""
     connected: bool = True
     vehicle_silent: bool = False
     slam: SlamStatus | None = "tracking"
@@ -70,6 +74,8 @@ class World:
     walker_velocity_m_s: Matrix = field(default_factory=lambda: np.zeros(2))
     eyes: bool = True
     """Whether the live guard sees anything."""
+    images: bool = True
+    """Whether depth images come to the live guard at all."""
     least_m: float = float("inf")
     """Least distance to a walker's middle so far."""
     events: list[Event] = field(default_factory=list)
@@ -80,6 +86,7 @@ class World:
     _target: Seen[Target] | None = None
     _vehicle: Seen[VehicleState] | None = None
     _trees: Seen[TreeList] | None = None
+    _last_view: Seen[View] | None = None
     _steps: int = 0
 
     def __post_init__(self) -> None:
@@ -151,13 +158,17 @@ class World:
         if not self.vehicle_silent:
             self._vehicle = Seen(self._vehicle_message(), self.now_ns)
 
-    def _view(self) -> Seen[View]:
+    def _view(self) -> Seen[View] | None:
+        if not self.images:
+            return self._last_view
         things = [Round(t.x_m, t.y_m, t.radius_m) for t in self.trees]
         things += [Round(float(w[0]), float(w[1]), 0.25) for w in self.walkers]
         things = things if self.eyes else []
         place, yaw = self.believed(self.position_m), wrap_angle(self.yaw_rad + self.shift_yaw_rad)
         key = (self.map_id, self.reset_counter)
-        return Seen(see(things, self.position_m[:2], self.yaw_rad, place, yaw, self.now_ns, key), self.now_ns)
+        view = see(things, self.position_m[:2], self.yaw_rad, place, yaw, self.now_ns, key)
+        self._last_view = Seen(view, self.now_ns)
+        return self._last_view
 
     def _pose_message(self, status: SlamStatus) -> Pose:
         T = level_camera(self.believed(self.position_m), wrap_angle(self.yaw_rad + self.shift_yaw_rad))
@@ -202,7 +213,7 @@ class World:
             stamp_ns=self.now_ns, seq=self._steps, connected=self.connected, armed=self.armed, mode=self.mode,
             landed="in_air" if self.position_m[2] > 0.05 else "on_ground", quaternion_map_body=None,
             position_map_m=None, velocity_map_m_s=None, battery_share=self.battery, vision_fused=True,
-            operator_override=self.override, engaged_mission_id=self.engaged_id, link_age_s=0.0,
+            operator_override=self.override, engaged_mission_id=self.engaged_id, link_age_s=0.0, note=self.note,
         )  # fmt: skip
 
     def _actuate(self, out: Outputs) -> None:
@@ -223,3 +234,17 @@ class World:
             goal = rotation_z(-self.shift_yaw_rad) @ (np.array(g.setpoint.position_m) - self.shift_m)
             self.position_m = self.position_m + 0.2 * (goal - self.position_m)
             self.yaw_rad += 0.4 * wrap_angle(g.setpoint.yaw_rad - self.shift_yaw_rad - self.yaw_rad)
+
+
+@functools.cache
+def _snapshot(state: str, *, station: bool) -> World:
+    world = World(station=station)
+    world.start()
+    assert world.run(state) == state, world.mission.reason
+    world.run(seconds=0.5)
+    return world
+
+
+def flying(state: str, *, station: bool = False) -> World:
+    """Return a world that flew to a state: flown once, each test gets a copy."""
+    return copy.deepcopy(_snapshot(state, station=station))

@@ -64,6 +64,22 @@ def test_another_who_falls_silent_in_time_is_forgiven() -> None:
     assert "holding" not in rig.bridge.state(rig.now_ns).note
 
 
+def test_what_ended_one_mission_does_not_keep_the_next_from_beginning() -> None:
+    rig = Rig()
+    rig.engage()
+    rig.setpoint = (np.array([0.5, 0.0, 1.0]), 0.0, np.zeros(3), 0.0)
+    for _ in range(90):
+        elsewhere = mav.MAVLink_position_target_local_ned_message(0, 1, 0, 4.0, *([0.0] * 10))
+        rig.bridge.handle(_from(elsewhere, 1, 1), rig.now_ns)
+        rig.run(0.1)
+    assert rig.mode == LAND_MODE
+    assert "another source?" in rig.bridge.state(rig.now_ns).note
+    rig.armed, rig.mode = False, POSITION_MODE
+    rig.run(1.0)
+    rig.engage(2)
+    assert rig.bridge.engagement.phase == "engaged", rig.bridge.state(rig.now_ns).note
+
+
 _OTHERS: list[dict[str, Any]] = [
     {"engage": False, "mission_id": 0}, {"engage": True, "mission_id": 9, "land": True},
     {"engage": True, "mission_id": 1, "land": True, "seq": 3},  # it was started in flight, and adopts what it finds

@@ -2,29 +2,12 @@
 
 from __future__ import annotations
 
-import copy
-import functools
-
 import numpy as np
 import pytest
 
 from services.navigator.config import NavigatorConfig
 from services.navigator.mission import Mission
-from tests.unit.navigator_world import STEP_S, World, tree
-
-
-@functools.cache
-def _snapshot(state: str, *, station: bool) -> World:
-    """Fly to a state once; tests get copies."""
-    world = World(station=station)
-    world.start()
-    assert world.run(state) == state, world.mission.reason
-    world.run(seconds=0.5)
-    return world
-
-
-def _flying(state: str, *, station: bool = False) -> World:
-    return copy.deepcopy(_snapshot(state, station=station))
+from tests.unit.navigator_world import STEP_S, World, flying, tree
 
 
 def _in(world: World, state: str) -> None:
@@ -47,7 +30,7 @@ def _seconds_until(world: World, state: str, limit_s: float) -> float:
 
 @pytest.mark.parametrize("state", ["take_off", "scan", "face", "approach", "dock", "docked", "landing"])
 def test_operator_takes_over_at_any_moment(state: str) -> None:
-    world = _flying(state)
+    world = flying(state)
     world.override, world.mode = True, "position"
     world.step()
     assert world.state == "released"
@@ -61,7 +44,7 @@ def test_operator_takes_over_at_any_moment(state: str) -> None:
 
 
 def test_disarmed_by_another_releases() -> None:
-    world = _flying("approach")
+    world = flying("approach")
     world.armed = False
     world.step()
     world.run(seconds=0.2)
@@ -77,14 +60,14 @@ def test_disarmed_by_another_releases() -> None:
 
 
 def test_mode_left_offboard_releases_even_before_the_bridge_says_so() -> None:
-    world = _flying("scan")
+    world = flying("scan")
     world.mode = "position"
     world.step()
     assert world.state == "released"
 
 
 def test_slam_lost_stops_at_once_then_goes_on() -> None:
-    world = _flying("approach")
+    world = flying("approach")
     world.slam = "lost"
     world.step()
     assert world.state == "hold"
@@ -98,7 +81,7 @@ def test_slam_lost_stops_at_once_then_goes_on() -> None:
 
 
 def test_slam_lost_for_long_lands() -> None:
-    world = _flying("approach")
+    world = flying("approach")
     world.slam = "lost"
     took = _seconds_until(world, "landing", 20.0)
     assert took == pytest.approx(world.config.failsafe.pose_land_s, abs=0.1)
@@ -107,7 +90,7 @@ def test_slam_lost_for_long_lands() -> None:
 
 def test_slam_flickering_is_not_slam_lost_for_long() -> None:
     """The limit counts from the last pose, not from when the hold began: what PX4 goes by."""
-    world = _flying("approach")
+    world = flying("approach")
     for _ in range(3):
         world.slam = "lost"
         world.run(seconds=0.6)
@@ -128,7 +111,7 @@ def test_handheld_waits_for_slam() -> None:
 
 @pytest.mark.parametrize("dead", ["slam", "camera"])
 def test_no_pose_holds_within_half_a_second(dead: str) -> None:
-    world = _flying("approach")
+    world = flying("approach")
     world.slam = None
     world.dead.add(dead)
     assert _seconds_until(world, "hold", 2.0) <= 0.5
@@ -139,7 +122,7 @@ def test_no_pose_holds_within_half_a_second(dead: str) -> None:
 
 
 def test_pose_jump_untold_holds() -> None:
-    world = _flying("approach")
+    world = flying("approach")
     world.correct(np.array([0.8, 0.0, 0.0]), 0.0, told=False)
     world.step()
     assert world.state == "hold"
@@ -149,7 +132,7 @@ def test_pose_jump_untold_holds() -> None:
 
 
 def test_small_correction_shifts_the_setpoint_in_the_same_step() -> None:
-    world = _flying("approach")
+    world = flying("approach")
     before = _setpoint(world)[0]
     world.correct(np.array([0.2, -0.1, 0.0]), 0.0)
     world.step()
@@ -160,7 +143,7 @@ def test_small_correction_shifts_the_setpoint_in_the_same_step() -> None:
 
 
 def test_large_correction_holds_then_goes_on() -> None:
-    world = _flying("approach")
+    world = flying("approach")
     world.correct(np.array([1.5, 0.0, 0.0]), 0.0)
     world.step()
     assert world.state == "hold"
@@ -168,7 +151,7 @@ def test_large_correction_holds_then_goes_on() -> None:
 
 
 def test_new_map_holds_and_drops_the_target() -> None:
-    world = _flying("approach")
+    world = flying("approach")
     assert world.mission.board.target_id is not None
     world.map_id = "m2"
     world.step()
@@ -181,7 +164,7 @@ def test_new_map_holds_and_drops_the_target() -> None:
 
 
 def test_target_lost_holds_then_goes_on_when_it_returns() -> None:
-    world = _flying("approach")
+    world = flying("approach")
     while (world.mission.board.to_axis() or (9.0, 0.0))[0] > 2.0:
         world.step()
     world.target_visible = False
@@ -191,13 +174,13 @@ def test_target_lost_holds_then_goes_on_when_it_returns() -> None:
 
 
 def test_target_lost_for_long_lands() -> None:
-    world = _flying("dock")
+    world = flying("dock")
     world.target_visible = False
     assert _seconds_until(world, "landing", 20.0) <= world.config.failsafe.target_hold_s + 1.0
 
 
 def test_refiner_killed_holds_within_half_a_second_and_goes_on_after_restart() -> None:
-    world = _flying("dock")
+    world = flying("dock")
     world.refiner_alive = False
     world.dead.add("refiner")
     assert _seconds_until(world, "hold", 2.0) <= 0.55
@@ -209,7 +192,7 @@ def test_refiner_killed_holds_within_half_a_second_and_goes_on_after_restart() -
 
 @pytest.mark.parametrize("service", ["mapper", "detector"])
 def test_dead_map_holds_while_it_is_needed(service: str) -> None:
-    world = _flying("scan")
+    world = flying("scan")
     world.dead.add(service)
     assert _seconds_until(world, "hold", 10.0) <= world.config.failsafe.service_silent_s + 0.1
     assert service in world.mission.reason
@@ -217,7 +200,7 @@ def test_dead_map_holds_while_it_is_needed(service: str) -> None:
 
 
 def test_dead_map_does_not_stop_the_approach() -> None:
-    world = _flying("approach")
+    world = flying("approach")
     world.dead.update({"mapper", "detector"})
     assert world.run("docked") == "docked"
 
@@ -234,14 +217,14 @@ def test_stale_list_of_trees_holds() -> None:
 
 
 def test_autopilot_link_lost_holds_then_lands() -> None:
-    world = _flying("approach")
+    world = flying("approach")
     world.vehicle_silent = True
     assert _seconds_until(world, "hold", 2.0) <= 0.6
     assert _seconds_until(world, "landing", 20.0) <= world.config.failsafe.vehicle_hold_s + 0.2
 
 
 def test_bridge_restarted_is_noticed() -> None:
-    world = _flying("approach")
+    world = flying("approach")
     world.engaged_id = 0
     world.step()
     assert world.state == "landing"
@@ -249,14 +232,14 @@ def test_bridge_restarted_is_noticed() -> None:
 
 
 def test_ground_link_lost_holds_then_lands_and_only_if_there_was_one() -> None:
-    world = _flying("scan", station=True)
+    world = flying("scan", station=True)
     world.station = False
     assert _seconds_until(world, "hold", 20.0) <= world.config.failsafe.ground_silent_s + 0.1
     assert _seconds_until(world, "landing", 60.0) <= world.config.failsafe.ground_hold_s + 0.2
 
 
 def test_battery_low_lands() -> None:
-    world = _flying("approach")
+    world = flying("approach")
     world.battery = 0.19
     world.step()
     assert world.state == "landing"
@@ -272,7 +255,7 @@ def test_low_battery_does_not_take_off() -> None:
 
 
 def test_outside_the_geofence_lands() -> None:
-    world = _flying("scan")
+    world = flying("scan")
     world.position_m = world.position_m + np.array([0.3, 0.0, 0.0])
     config = world.config.motion
     assert world.mission.board.trajectory.fence is not None
@@ -282,7 +265,7 @@ def test_outside_the_geofence_lands() -> None:
 
 
 def test_a_trunk_in_the_way_brakes() -> None:
-    world = _flying("approach")
+    world = flying("approach")
     world.eyes = False  # only the map knows
     here, velocity = world.position_m[:2], _setpoint(world)[1][:2]
     assert np.linalg.norm(velocity) > 0.05
@@ -300,7 +283,7 @@ def _restarted(world: World) -> World:
 
 
 def test_navigator_restarted_in_flight_holds_then_lands() -> None:
-    world = _restarted(_flying("approach"))
+    world = _restarted(flying("approach"))
     world.run("hold", 1.0)
     assert world.state == "hold"
     assert "restarted" in world.mission.reason
@@ -312,7 +295,7 @@ def test_navigator_restarted_in_flight_holds_then_lands() -> None:
 
 
 def test_navigator_restarted_in_flight_goes_on_when_told() -> None:
-    world = _restarted(_flying("approach"))
+    world = _restarted(flying("approach"))
     world.run("hold", 1.0)
     world.run(seconds=1.0)
     assert world.mission.order("resume", None, world.now_ns).accepted
@@ -329,7 +312,7 @@ def test_navigator_restarted_on_the_ground_waits_for_a_command() -> None:
 @pytest.mark.parametrize("order", ["abort", "land", "hold"])
 @pytest.mark.parametrize("state", ["scan", "face", "approach", "dock", "docked"])
 def test_orders_act_at_once(order: str, state: str) -> None:
-    world = _flying(state)
+    world = flying(state)
     assert world.mission.order(order, None, world.now_ns).accepted  # type: ignore[arg-type]
     world.step()
     assert world.state == ("hold" if order == "hold" else "landing")
@@ -339,7 +322,7 @@ def test_orders_act_at_once(order: str, state: str) -> None:
 
 
 def test_operator_hold_waits_for_resume() -> None:
-    world = _flying("approach")
+    world = flying("approach")
     world.mission.order("hold", None, world.now_ns)
     world.run(seconds=30.0)
     assert world.state == "hold"
@@ -351,7 +334,7 @@ def test_operator_hold_waits_for_resume() -> None:
 
 
 def test_start_is_refused_in_the_air_and_without_a_vehicle() -> None:
-    world = _flying("scan")
+    world = flying("scan")
     assert not world.mission.order("start", None, world.now_ns).accepted
     world.override = True
     world.step()
@@ -361,7 +344,7 @@ def test_start_is_refused_in_the_air_and_without_a_vehicle() -> None:
 
 
 def test_choose_and_next() -> None:
-    world = _flying("approach")
+    world = flying("approach")
     first = world.mission.board.target_id
     other = next(t.id for t in world.trees if t.id != first)
     assert not world.mission.order("choose", 77, world.now_ns).accepted

@@ -186,6 +186,11 @@ class Flights(RuleBasedStateMachine):
         self.world.vehicle_silent = silent
         self._step(0.2)
 
+    @rule(come=st.booleans(), seconds=st.sampled_from([0.3, 2.0]))
+    def images(self, come: bool, seconds: float) -> None:
+        self.world.images = come
+        self._step(seconds)
+
     @rule(share=st.sampled_from([0.9, 0.3, 0.1, None]))
     def battery(self, share: float | None) -> None:
         self.world.battery = share

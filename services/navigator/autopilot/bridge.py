@@ -139,6 +139,8 @@ class Bridge:
         if self._is_due("agree", now_ns, _AGREE_NS):
             self.telemetry.agree(self.vision.body(now_ns), now_ns)
         orders = self.engagement.update(self.vehicle(now_ns), now_ns)
+        if self.engagement.phase != "engaged":
+            self.foreign.not_followed()
         if self.engagement.streams:
             if self._is_due("setpoint", now_ns, round(1e9 / self.config.setpoint_hz)):
                 out.extend(self._setpoint(system, now_ns))

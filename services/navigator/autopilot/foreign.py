@@ -59,6 +59,10 @@ class Foreign:
         self._sent.clear()
         self._off_since_ns = None
 
+    def not_followed(self) -> None:
+        """Note that the autopilot does not fly to our setpoints now, nor should."""
+        self._off_since_ns = None
+
     def flown_to(self, message: mav.MAVLink_position_target_local_ned_message, now_ns: int) -> None:
         """Take what the autopilot says it flies to, while it flies to ours."""
         place = np.array([message.x, message.y, message.z])
