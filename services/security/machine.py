@@ -6,6 +6,7 @@ import contextlib
 import datetime as dt
 import os
 from collections.abc import Collection
+from dataclasses import dataclass
 from pathlib import Path
 
 from cryptography import x509
@@ -19,10 +20,20 @@ from services.security.identity import Identity
 from services.security.register import Register
 
 
-def bring(source: Path, to: Path, now: dt.datetime) -> list[Path]:
+@dataclass(frozen=True, slots=True)
+class Brought:
+    """What an import did to the machine's folder."""
+
+    files: tuple[Path, ...]
+    changed: tuple[Identity, ...]
+    """Of those whose other pair was there before: what runs with them shows the old one until it connects anew."""
+
+
+def bring(source: Path, to: Path, now: dt.datetime) -> Brought:
     """Copy what ``certs export`` put into ``source`` to this machine's folder, after looking at all of it.
 
-    The files belong to the folder's owner afterwards (the services' user), also when an administrator brings them.
+    The files belong to the folder's owner afterwards (the services' user), also when an administrator brings them. The list
+    comes last: a router that runs starts anew with it, and whoever then connects again has to find the pair that it names.
 
     Raises:
         InputError: something is missing, damaged, expired, revoked or of another authority, or older than what the machine
@@ -35,7 +46,7 @@ def bring(source: Path, to: Path, now: dt.datetime) -> list[Path]:
     authority = _certificate(source / CA_CERTIFICATE)
     register = Register.read(source)
     valid = register.valid_names()
-    names = [CA_CERTIFICATE, Register.FILE]
+    names, changed = [CA_CERTIFICATE], []
     for path in sorted(source.glob("*.pem")):
         if path.name == CA_CERTIFICATE:
             continue
@@ -44,16 +55,24 @@ def bring(source: Path, to: Path, now: dt.datetime) -> list[Path]:
             end = f"{certificate.not_valid_after_utc:%Y-%m-%d}"
             raise InputError(f"{path}: expired on {end}; `treedock certs renew` first")
         names += [path.name, path.with_suffix(".key").name]
+        if _another(path, to / path.name):
+            changed.append(Identity.parse(path.stem))
+    names.append(Register.FILE)
     _check_later(to, authority, register, names, source)
     make_folder(to, 0o700)
     owner = to.stat()
-    files = []
     for name in names:
         write_whole(to / name, (source / name).read_bytes(), 0o600 if name.endswith(".key") else 0o644)
         with contextlib.suppress(PermissionError):  # only root may give files away, and only root needs to
             os.chown(to / name, owner.st_uid, owner.st_gid)
-        files.append(to / name)
-    return files
+    return Brought(tuple(to / name for name in names), tuple(changed))
+
+
+def _another(path: Path, there: Path) -> bool:
+    try:
+        return there.read_bytes() != path.read_bytes()
+    except OSError:
+        return False
 
 
 def _check_later(
