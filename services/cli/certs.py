@@ -133,6 +133,8 @@ def import_(
         f'{len(brought.files)} files in {to}; security.folder = "{to}" and router.protocol = "tls" make the services use '
         "them. A router that runs takes a new list by itself"
     )
+    if brought.revoked:
+        typer.echo(f"revoked, left out and removed where they were: {', '.join(brought.revoked)}")
     if brought.changed:
         typer.echo(f"certificates that were here changed, restart what runs with them: {_restart_of(brought.changed)}")
 

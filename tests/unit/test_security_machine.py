@@ -14,7 +14,7 @@ from services.cli.app import invoke
 from services.common.errors import InputError
 from services.security.authority import Authority
 from services.security.identity import Identity
-from services.security.machine import bring
+from services.security.machine import bring, faults_in
 from services.security.register import Register
 
 NOW = dt.datetime(2026, 11, 1, tzinfo=dt.UTC)
@@ -52,9 +52,9 @@ def _swapped(stick: Path) -> None:
     shutil.copy(stick / "uav1.camera.key", stick / "uav1.slam.key")
 
 
-def _revoked(stick: Path) -> None:
+def _renewed_since(stick: Path) -> None:
     fleet = stick.parent / "fleet"
-    Authority.open(fleet).revoke(SLAM)
+    Authority.open(fleet).issue(SLAM, NOW)
     shutil.copy(fleet / "identities.json", stick)
 
 
@@ -69,7 +69,7 @@ def _revoked(stick: Path) -> None:
         (lambda stick: (stick / "uav1.slam.pem").write_text("x"), "damaged"),
         (_other_authority, "another authority"),
         (_swapped, "does not belong"),
-        (_revoked, "revoked"),
+        (_renewed_since, r"uav1\.slam\.1 is revoked .*; export it again"),
     ],
 )
 def test_an_unsound_set_is_refused_and_nothing_changes(
@@ -79,6 +79,32 @@ def test_an_unsound_set_is_refused_and_nothing_changes(
     with pytest.raises(InputError, match=words):
         bring(stick, tmp_path / "certs", NOW)
     assert not (tmp_path / "certs").exists()
+
+
+def test_a_revoked_pair_stays_behind_on_the_stick_and_leaves_the_machine(
+    stick: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    certs = tmp_path / "certs"
+    bring(stick, certs, NOW)
+    authority = Authority.open(tmp_path / "fleet").revoke(CAMERA).issue(SLAM, NOW)
+    authority.export([SLAM], stick)
+    shutil.copy(stick / Register.FILE, certs)
+    assert any("rm " in fault and "uav1.camera.key" in fault for fault in faults_in(certs))
+    assert invoke(["certs", "import", str(stick), "--to", str(certs)]) == 0
+    assert "removed where they were: uav1.camera\n" in capsys.readouterr().out
+    assert faults_in(certs) == []
+    assert not list(certs.glob("uav1.camera.*"))
+    assert (stick / "uav1.camera.pem").exists()
+
+
+def test_one_that_was_renewed_elsewhere_stays_until_its_own_comes(stick: Path, tmp_path: Path) -> None:
+    certs = tmp_path / "certs"
+    bring(stick, certs, NOW)
+    Authority.open(tmp_path / "fleet").issue(CAMERA, NOW).export([SLAM], tmp_path / "other")
+    assert not bring(tmp_path / "other", certs, NOW).revoked
+    (fault,) = faults_in(certs)
+    assert "uav1.camera.1 is revoked" in fault
+    assert "rm " not in fault
 
 
 @pytest.mark.parametrize("way", ["import", "export"])
