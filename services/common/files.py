@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -21,8 +22,12 @@ def make_folder(folder: Path, mode: int = 0o755) -> None:
         raise InputError(f"{folder}: {error.strerror}; name a folder that you can write") from error
 
 
-def write_whole(path: Path, body: bytes, mode: int = 0o644, *, lasting: bool = True) -> None:
+def write_whole(
+    path: Path, body: bytes, mode: int = 0o644, *, lasting: bool = True, like: os.stat_result | None = None
+) -> None:
     """Write ``body`` beside ``path``, flush it to the disk, and put it in its place; never readable beyond ``mode``.
+
+    ``like``: of the file whose owner and rights it takes, whatever the umask says.
 
     ``lasting=False`` does not wait for the disk: whole for whoever comes after a process that was killed, not after a power
     cut.
@@ -30,15 +35,19 @@ def write_whole(path: Path, body: bytes, mode: int = 0o644, *, lasting: bool = T
     Raises:
         InputError: the disk refused; ``path`` is then as it was.
     """
-    write_parts(path, (body,), mode, lasting=lasting)
+    write_parts(path, (body,), mode, lasting=lasting, like=like)
 
 
-def write_parts(path: Path, parts: Iterable[bytes], mode: int = 0o644, *, lasting: bool = True) -> None:
+def write_parts(
+    path: Path, parts: Iterable[bytes], mode: int = 0o644, *, lasting: bool = True, like: os.stat_result | None = None
+) -> None:
     """Do as ``write_whole`` with a content too large to be held at once."""
     fresh = path.with_name(f".{path.name}.new")
     try:
         fresh.unlink(missing_ok=True)
         with os.fdopen(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as out:
+            if like is not None:
+                make_alike(out.fileno(), like)
             for part in parts:
                 out.write(part)
             out.flush()
@@ -49,6 +58,13 @@ def write_parts(path: Path, parts: Iterable[bytes], mode: int = 0o644, *, lastin
             _sync_names(path.parent)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def make_alike(handle: int, like: os.stat_result) -> None:
+    """Give an open file owner and rights of another, as far as this user may."""
+    with contextlib.suppress(PermissionError):  # only root may give files away, and only root needs to
+        os.fchown(handle, like.st_uid, like.st_gid)
+    os.fchmod(handle, like.st_mode & 0o777)
 
 
 def _sync_names(folder: Path) -> None:
