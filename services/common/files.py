@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 from collections.abc import Iterable
 from pathlib import Path
+from typing import TextIO
 
 from services.common.errors import InputError
 
@@ -58,6 +60,35 @@ def write_parts(
             _sync_names(path.parent)
     except OSError as error:
         raise InputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def locked_beside(path: Path, about: str, taken: str) -> TextIO:
+    """Keep other processes out of ``path`` by a lock file beside it, which is closed to let go; its folder is made.
+
+    Args:
+        path: what is kept.
+        about: what that is, for the error.
+        taken: what is wrong, and what to do, when another process has it.
+
+    Raises:
+        InputError: another process has it, or the lock file cannot be written.
+    """
+    file = path.parent / f".{path.name}.lock"
+    make_folder(path.parent)
+    try:
+        lock = file.open("w")
+    except OSError as error:
+        do = "it has to be writable for whom keeps it, as the services' user"
+        raise InputError(f"{about} {path}: {file} cannot be opened: {error.strerror}; {do}") from error
+    with contextlib.suppress(PermissionError):  # an administrator's would keep the services out afterwards
+        owner = path.parent.stat()
+        os.fchown(lock.fileno(), owner.st_uid, owner.st_gid)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        lock.close()
+        raise InputError(f"{about} {path}: {taken}") from None
+    return lock
 
 
 def make_alike(handle: int, like: os.stat_result) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from pathlib import Path
 
 import pytest
@@ -39,6 +40,24 @@ def test_a_second_arbiter_is_refused_the_book(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="another arbiter keeps this book"):
         Journal(tmp_path / "fleet.json", ORIGIN)
     first.close()
+
+
+def test_a_lock_that_cannot_be_opened_is_told_with_its_name(tmp_path: Path) -> None:
+    (tmp_path / ".fleet.json.lock").mkdir()  # for root, too; others see the like of one that root made
+    with pytest.raises(InputError, match=r"\.fleet\.json\.lock cannot be opened"):
+        Journal(tmp_path / "fleet.json", ORIGIN)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
+def test_what_an_administrator_does_with_the_book_leaves_it_to_the_station(tmp_path: Path) -> None:
+    os.chown(tmp_path, 4711, 4711)
+    path = tmp_path / "fleet.json"
+    journal = Journal(path, ORIGIN)
+    journal.write(MEMORY)
+    journal.close()
+    os.chown(path, 4711, 4711)
+    forget(config=None, settings=[f"station.fleet.book={path}"])
+    assert {file.stat().st_uid for file in tmp_path.iterdir()} == {4711}
 
 
 @pytest.mark.parametrize(
