@@ -74,7 +74,7 @@ class Facts:
     version: str = ""
     """Of the treedock that asks."""
     units: Mapping[str, str] = field(default_factory=dict)
-    """Unit name to systemd's ActiveState; empty when none is installed."""
+    """Unit name to systemd's ActiveState, of those that are to run here; empty when none is installed."""
     station: bool = False
     """This machine is a ground station and no aircraft: it has no camera, passes no frames on and records nothing."""
     certificates: Mapping[str, float] = field(default_factory=dict)
@@ -110,3 +110,8 @@ class Facts:
     """Its age; None: it does not say."""
     real: bool = False
     """The configuration says that a real aircraft is flown."""
+
+
+def service_of(unit: str) -> str:
+    """Return the service that a unit runs: ``slam`` of ``treedock-slam.service``."""
+    return unit.removeprefix("treedock-").removesuffix(".service")

@@ -151,6 +151,18 @@ def test_a_system_that_does_not_answer_is_no_bug(monkeypatch: pytest.MonkeyPatch
     assert (facts.units, facts.clock_synchronised, facts.station) == ({}, None, False)
 
 
+@pytest.mark.parametrize(("identity", "wanted"), [("", {"slam", "recorder"}), ("station.alice", {"slam", "station"})])
+def test_units_that_are_not_to_run_here_are_not_missed(
+    monkeypatch: pytest.MonkeyPatch, identity: str, wanted: set[str]
+) -> None:
+    states = {"slam": "active", "recorder": "inactive", "station": "inactive", "fusion": "inactive"}
+    listed = "".join(f"treedock-{name}.service loaded {state} dead what it is\n" for name, state in states.items())
+    listed += "treedock-gone.service not-found inactive dead\n"
+    monkeypatch.setattr("services.doctor.facts._said", lambda *words: listed if "list-units" in words else "")
+    config = TreedockConfig.model_validate({"router": {"port": 1}, "security": {"identity": identity}})
+    assert set(gather(config).units) == {f"treedock-{name}.service" for name in wanted}
+
+
 def test_what_could_not_be_mended_is_not_called_fixed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
