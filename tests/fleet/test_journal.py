@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from schemas.fleet import ClaimGoal
+from services.cli.app import invoke
 from services.cli.fleet import forget, list_book
 from services.common.errors import InputError
 from services.fleet.book import Done, Lease, Memory
@@ -46,6 +47,16 @@ def test_a_lock_that_cannot_be_opened_is_told_with_its_name(tmp_path: Path) -> N
     (tmp_path / ".fleet.json.lock").mkdir()  # for root, too; others see the like of one that root made
     with pytest.raises(InputError, match=r"\.fleet\.json\.lock cannot be opened"):
         Journal(tmp_path / "fleet.json", ORIGIN)
+
+
+@pytest.mark.parametrize("word", ["forget", "list"])
+def test_where_there_is_no_book_the_operator_is_told_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], word: str
+) -> None:
+    book = tmp_path / "of-somebody-else/fleet.json"
+    assert invoke(["fleet", word, "--set", f"station.fleet.book={book}"]) == 2
+    assert str(book) in capsys.readouterr().err
+    assert not book.parent.exists()
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")

@@ -17,8 +17,9 @@ from services.cli import run as run_module
 from services.cli import scratch
 from services.cli.mission import Conductor, Flown, prepared
 from services.cli.run import Run
-from services.cli.run_plan import services_for, with_trees
+from services.cli.run_plan import services_for, with_own_inventory, with_trees
 from services.common.config import TreedockConfig
+from services.common.config_loader import load
 from services.common.errors import InputError
 from services.common.stop import StopSignal
 from services.evaluate.flown import mission_figures
@@ -73,6 +74,17 @@ def test_folders_of_killed_runs_are_cleared_away_and_no_others(tmp_path: Path) -
     (tmp_path / "treedock-run-kept").mkdir()
     assert [p.name for p in scratch.clear_stale(tmp_path)] == ["treedock-run-dead"]
     assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_a_run_keeps_out_of_the_installed_stations_inventory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trees of a simulation would lie among the real ones."""
+    text = '[station]\ninventory.database = "/installed.gpkg"\nfleet.book = "/installed.json"\n'
+    (tmp_path / "10-treedock.toml").write_text(text)
+    monkeypatch.setattr("services.common.config_loader.SYSTEM_DIRECTORY", tmp_path)
+    station = with_own_inventory(load(environ={}, system_directory=tmp_path)).station
+    assert (station.inventory.database, station.fleet.book) == ("", "")
+    asked = load(flags=["station.inventory.database=mine.gpkg"], environ={}, system_directory=tmp_path)
+    assert with_own_inventory(asked).station.inventory.database == "mine.gpkg"
 
 
 def test_a_port_lost_to_another_process_is_chosen_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
