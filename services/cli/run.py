@@ -192,14 +192,14 @@ class Run:
     def _supervised(self, supervisor: Supervisor, stop: StopSignal) -> int:
         from services.cli.status import Status
         from services.cli.watch import Watch
-        from services.common.session import opened_client
+        from services.common.session import opened_node
 
         begin_s = time.monotonic()
         supervisor.check()
         with ExitStack() as stack:
             endpoint = self._tree.router.endpoint
             waiting = self._still_waiting(supervisor, stop)
-            session = stack.enter_context(opened_client(endpoint, waiting, wait_s=_ROUTER_WITHIN_S))
+            session = stack.enter_context(opened_node(self._tree, None, waiting, _ROUTER_WITHIN_S))
             watch = Watch(session, self._tree.uav, lambda h: supervisor.heard(h.service, h.pid, h.state))
             with Status(watch, supervisor, self._console, self._expected) as status:
                 self._console.print(f"treedock: router on {endpoint}, logs in {self._folder}", highlight=False)
