@@ -8,6 +8,7 @@ import stat
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from cryptography import x509
@@ -100,7 +101,12 @@ def test_radio_rules_thin_and_limit_what_the_table_names() -> None:
     rules = radio_rules(("wlan0",))
     text = json.dumps(rules)
     assert '"key_expr": "treedock/v1/*/slam/pose", "freq": 5' in text
-    assert "camera/rgbd" not in text
+    limits = {
+        key: rule["size_limit"] for rule in cast("list[Any]", rules["low_pass_filter"]) for key in rule["key_exprs"]
+    }
+    assert {topic.key("*") for topic in TOPICS if limits[topic.key("*")] == 0} == {
+        topic.key("*") for topic in TOPICS if topic.reach is not Reach.RADIO
+    }
     assert find("slam/pose").max_bytes <= 64 * 1024
 
 
