@@ -23,6 +23,7 @@ from services.common.version import running_version
 from services.doctor.model import Facts, ServiceFact, VehicleFact, service_of
 from services.doctor.told import told
 from services.doctor.twins import Twins
+from services.router.radio import absent
 from services.security.identity import STATION
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ def gather(config: TreedockConfig) -> Facts:
         loose_keys=_loose_keys(folder) if folder else (),
         foreign_keys=_foreign_keys(folder) if folder else (),
         encrypted=folder is not None,
+        radio_absent=absent(config.security.radio_interfaces) if folder and not station else (),
         reachable_from_outside=not config.router.local,
         clock_synchronised=_synchronised(),
         lockable_bytes=lockable_bytes(),

@@ -9,6 +9,7 @@ from schemas.topics import CAMERA_RGBD
 from services.common.memlock import too_little
 from services.doctor.aboard import aboard, certificate, disk
 from services.doctor.model import Facts, Finding, service_of
+from services.router.radio import in_words
 
 CALIBRATION_WARN_DAYS = 180
 AUTHORITY = "ca"
@@ -21,7 +22,7 @@ LEAST_LOCKED_BYTES = 1_000_000
 
 def judge(facts: Facts) -> list[Finding]:
     """Return the findings, in the order in which a person would go about them."""
-    found = [*_rights(facts), *_units(facts), *_bus(facts), *_security(facts), *_clock(facts)]
+    found = [*_rights(facts), *_units(facts), *_bus(facts), *_security(facts), *_radio(facts), *_clock(facts)]
     return found if facts.station else [*found, *_memory(facts), *_disk(facts), *_camera(facts)]
 
 
@@ -96,6 +97,11 @@ def _security(f: Facts) -> list[Finding]:
     if not found and not f.certificates:
         return [Finding("certificates", "unknown", "they could not be looked at", "sudo treedock doctor")]
     return found or [Finding("certificates", "ok", f"{len(f.certificates)} valid")]
+
+
+def _radio(f: Facts) -> list[Finding]:
+    do = "ip link shows this machine's interfaces; correct security.radio_interfaces in /etc/treedock"
+    return [Finding("radio", "warn", in_words(f.radio_absent), do)] if f.radio_absent else []
 
 
 def _authority(days: float) -> list[Finding]:

@@ -86,6 +86,8 @@ class Facts:
     foreign_keys: Sequence[str] = ()
     """Private keys that the owner of their folder, the services' user, may not read."""
     encrypted: bool = False
+    radio_absent: Sequence[str] = ()
+    """Radio interfaces of the configuration that this machine does not have."""
     reachable_from_outside: bool = False
     clock_synchronised: bool | None = None
     lockable_bytes: int | None = None

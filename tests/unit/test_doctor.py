@@ -147,6 +147,7 @@ def test_a_sound_machine_has_no_trouble() -> None:
         ),
         (replace(ENCRYPTED, certificate_faults=("a.pem: damaged",)), "certificate", "fail", "a.pem: damaged"),
         (replace(ENCRYPTED, certificates={}), "certificates", "unknown", "could not be looked at"),
+        (replace(ENCRYPTED, radio_absent=("wlan7",)), "radio", "warn", "wlan7: no network interface here"),
         (replace(ENCRYPTED, loose_keys=("/etc/x.key",)), "keys", "fail", "/etc/x.key"),
         (replace(ENCRYPTED, foreign_keys=("/etc/x.key",)), "keys", "fail", "services' user"),
     ],
