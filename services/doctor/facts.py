@@ -60,7 +60,7 @@ def gather(config: TreedockConfig) -> Facts:
         shm_free_bytes=_free(Path("/dev/shm")),
         closed=_closed((folder, config.recorder.folder)),
         disk_reserve_bytes=config.recorder.reserve_mb * 1_000_000,
-        disk_free_bytes=_free(_nearest(config.recorder.folder)),
+        disk_free_bytes=_free(_nearest(config.recorder.folder)) if config.recorder.mcap else None,
         recordings_cut=_cut(config.recorder.folder),
         camera=camera,
         camera_mbit=mbit,

@@ -96,6 +96,7 @@ class Facts:
     closed: Sequence[str] = ()
     """Folders that this user may not look into."""
     disk_free_bytes: int | None = None
+    """Of the disk that is recorded on; None also where nothing is recorded (``recorder.mcap``)."""
     disk_reserve_bytes: int = 500_000_000
     """What the recorder leaves free (``recorder.reserve_mb``)."""
     recordings_cut: Sequence[str] = ()

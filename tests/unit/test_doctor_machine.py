@@ -96,6 +96,9 @@ def test_a_machine_is_really_looked_at(tmp_path: Path) -> None:
     assert facts.recordings_cut == [str(recordings / "a.mcap")]
     assert facts.camera is None
     assert facts.disk_free_bytes is not None
+    without = config.recorder.model_copy(update={"mcap": False})
+    none = gather(config.model_copy(update={"recorder": without})).disk_free_bytes
+    assert none is None, "the doctor's own advice to a full disk: nothing is recorded there"
 
 
 def _nothing(folder: Path) -> None:
