@@ -73,10 +73,11 @@ def forget(*, config: ConfigFile = None, settings: Settings = None) -> None:
 
 def _journal(config: Path | None, settings: list[str] | None) -> Journal:
     from services.common.errors import InputError
+    from services.common.files import is_there
     from services.fleet.journal import Journal, book_path
 
     path = book_path(loaded(config, settings, None).config.station.fleet)
-    if not path.is_file():  # another user's, or none: a new one would be empty, and its forgetting would say done
+    if not is_there(path):  # another user's, or none: a new one would be empty, and its forgetting would say done
         raise InputError(f"{path}: there is no book; name the station's with --set station.fleet.book=FILE")
     return Journal(path, None)
 

@@ -24,6 +24,18 @@ def make_folder(folder: Path, mode: int = 0o755) -> None:
         raise InputError(f"{folder}: {error.strerror}; name a folder that you can write") from error
 
 
+def is_there(path: Path) -> bool:
+    """Return whether there is such a file.
+
+    Raises:
+        InputError: this user may not look into its folder, which is no reason to call it missing.
+    """
+    try:
+        return path.is_file()
+    except PermissionError as error:
+        raise InputError(f"{path}: this user may not look there; sudo, or the services' own user, may") from error
+
+
 def write_whole(
     path: Path, body: bytes, mode: int = 0o644, *, lasting: bool = True, like: os.stat_result | None = None
 ) -> None:

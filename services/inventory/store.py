@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from services.common.errors import InputError
-from services.common.files import locked_beside
+from services.common.files import is_there, locked_beside
 from services.inventory.geopackage import GeoPackage
 from services.inventory.values import Changes, Contents, Site
 
@@ -51,7 +51,7 @@ def open_store(database: str, *, read_only: bool = False) -> Store:
         return PostGis(database, read_only=read_only)
     path = Path(database).expanduser() if database else default_path()
     if read_only:
-        if not path.is_file():
+        if not is_there(path):
             raise InputError(f"inventory {path}: there is no such file; name one with --database FILE")
         return GeoPackage(path, read_only=True)
     return _Locked(path)

@@ -59,6 +59,22 @@ def test_where_there_is_no_book_the_operator_is_told_so(
     assert not book.parent.exists()
 
 
+@pytest.mark.parametrize(
+    ("words", "key"), [(["fleet", "forget"], "fleet.book"), (["inventory", "show"], "inventory.database")]
+)
+def test_a_user_who_may_not_look_there_is_told_so(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, words: list[str], key: str
+) -> None:
+    """The installed station's folder is closed to others, who are no bug."""
+
+    def closed(path: Path) -> bool:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "is_file", closed)
+    assert invoke([*words, "--set", f"station.{key}=/nowhere/file"]) == 2
+    assert "/nowhere/file: this user may not look there; sudo" in capsys.readouterr().err
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
 def test_what_an_administrator_does_with_the_book_leaves_it_to_the_station(tmp_path: Path) -> None:
     os.chown(tmp_path, 4711, 4711)
