@@ -100,3 +100,26 @@ def kept_name(config: Path, uav: str) -> str:
     except (OSError, ValueError):  # not there yet in a dry run; what is wrong with it `treedock config` says
         return ""
     return f"{config} stays as it is and says uav = {kept!r}, not {uav!r}: change it there" if kept != uav else ""
+
+
+def elsewhere(config: Path, folder: Path) -> str:
+    """Return what to do where a station keeps, or kept, inventory and book in its user's ``folder``, as older ones did."""
+    keys = {"inventory.gpkg": ("inventory", "database"), "fleet.json": ("fleet", "book")}
+    try:
+        station = tomllib.loads(config.read_text()).get("station", {})
+        places = {name: station.get(table, {}).get(key, "") for name, (table, key) in keys.items()}
+        kept = [name for name in keys if (folder / name).exists()]
+        left = [name for name in kept if Path(places[name]).name == name and not Path(places[name]).exists()]
+    except (
+        OSError,
+        ValueError,
+        AttributeError,
+    ):  # not there yet in a dry run; what is wrong with it `treedock config` says
+        return ""
+    unnamed = [f'\n      {".".join(keys[name])} = "{folder / name}"' for name in kept if not places[name]]
+    if unnamed:
+        do = f"add to {config}:\n      [station]{''.join(unnamed)}"
+        return f"so that `sudo treedock inventory` and `fleet` find what the station keeps, {do}"
+    moves = "; ".join(f"mv {folder / name}* {Path(places[name]).parent}/" for name in left)
+    do = "As root, while it is stopped"
+    return f"the station looks elsewhere now than in {folder}, where its files lie. {do}: {moves}" if moves else ""

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import units
 from actions import Action, Folder, InstallError, Link, Remove, Run, Write
-from checks import MARK, check, kept_name
+from checks import MARK, check, elsewhere, kept_name
 
 SOURCE = Path(__file__).resolve().parents[1]
 USER = "treedock"
@@ -34,6 +34,8 @@ BOOTED = Path("/run/systemd/system")
 STAMP = f"{MARK}/source.sha256"
 """Below the prefix: what was installed, by its bytes."""
 KERNELS = f"var/cache/{USER}/numba"
+HOME_DATA = f"var/lib/{USER}/.local/share/{USER}"
+"""Where a station keeps what its configuration names no place for."""
 RULES = "etc/udev/rules.d/60-treedock.rules"
 _UAV = "uav1"
 _CAP_IPC_LOCK = 1 << 14
@@ -266,6 +268,8 @@ def main(arguments: Sequence[str]) -> int:
         return 2
     if verb == "install" and options.named and (other := kept_name(options.at(CONFIG), options.uav)):
         sys.stdout.write(f"note: {other}\n")
+    if verb == "install" and (left := elsewhere(options.at(CONFIG), options.at(HOME_DATA))):
+        sys.stdout.write(f"note: {left}\n")
     if verb == "install" and not options.dry_run and not options.enable and options.live:
         target = TARGET_OF[options.role]
         sys.stdout.write(f"installed; look at {options.at(CONFIG)}, then: systemctl enable --now {target}\n")

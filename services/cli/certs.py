@@ -80,8 +80,8 @@ def revoke(names: Names, *, folder: Folder = _FOLDER) -> None:
             authority.holding(identity)
         _revoke_all(authority, identities)
     typer.echo(
-        f"bring the new {folder / 'identities.json'} to every router's machine (certs export and import, or copy it to "
-        "/etc/treedock/certs): the router there takes it within seconds"
+        f"bring the new {folder / 'identities.json'} to every router's machine (certs export and import; where nothing was "
+        "renewed since, copying it to /etc/treedock/certs does): the router there takes it within seconds"
     )
 
 
@@ -128,11 +128,23 @@ def import_(
     """Check what was exported for this machine and lay it where its services look."""
     from services.security.machine import bring
 
-    files = bring(source, to, _now())
+    brought = bring(source, to, _now())
     typer.echo(
-        f'{len(files)} files in {to}; security.folder = "{to}" and router.protocol = "tls" make the services use '
+        f'{len(brought.files)} files in {to}; security.folder = "{to}" and router.protocol = "tls" make the services use '
         "them. A router that runs takes a new list by itself"
     )
+    if brought.revoked:
+        typer.echo(f"revoked, left out and removed where they were: {', '.join(brought.revoked)}")
+    if brought.changed:
+        typer.echo(f"certificates that were here changed, restart what runs with them: {_restart_of(brought.changed)}")
+
+
+def _restart_of(changed: Sequence[Identity]) -> str:
+    from services.security.identity import STATION
+
+    ground = {identity.role == STATION for identity in changed}
+    targets = " ".join(f"treedock{'-station' * here}.target" for here in sorted(ground))
+    return f"sudo systemctl restart {targets}"
 
 
 @contextmanager

@@ -72,9 +72,14 @@ def forget(*, config: ConfigFile = None, settings: Settings = None) -> None:
 
 
 def _journal(config: Path | None, settings: list[str] | None) -> Journal:
+    from services.common.errors import InputError
+    from services.common.files import is_there
     from services.fleet.journal import Journal, book_path
 
-    return Journal(book_path(loaded(config, settings, None).config.station.fleet), None)
+    path = book_path(loaded(config, settings, None).config.station.fleet)
+    if not is_there(path):  # another user's, or none: a new one would be empty, and its forgetting would say done
+        raise InputError(f"{path}: there is no book; name the station's with --set station.fleet.book=FILE")
+    return Journal(path, None)
 
 
 def _done_rows(journal: Journal) -> list[dict[str, Any]]:

@@ -35,6 +35,11 @@ def replay(
     check_span(span)
     result = play(loaded(config, settings, port).config, file, span, everything=everything)
     typer.echo(said(file, span, result), err=True)
+    if result.denied:
+        words = ", ".join(f"{count} of {name}" for name, count in sorted(result.denied.items()))
+        typer.echo(
+            f"left out: {words}: on an encrypted bus a replay speaks as the camera, which may not say them", err=True
+        )
     for fault in result.faults[:5]:
         typer.echo(f"left out: {fault}", err=True)
     if len(result.faults) > 5:
@@ -44,7 +49,7 @@ def replay(
 
 def said(file: Path, span: Span, played: Played) -> str:
     """Return what was played in words; where that is less than was asked for, how long the recording is."""
-    less = not played.sent or (span.end_s is not None and span.end_s > played.length_s)
+    less = not (played.sent or played.denied) or (span.end_s is not None and span.end_s > played.length_s)
     return f"{played.sent} messages of {file.name} in {played.seconds:.1f} s" + (
         f"; the recording is only {played.length_s:.1f} s long" if less else ""
     )

@@ -16,7 +16,15 @@ import typer
 
 from services.cli import scratch
 from services.cli.options import AsJson, ConfigFile, Port, Settings, loaded
-from services.cli.run_plan import expected_frames, services_for, with_port, with_recorder, with_state, with_trees
+from services.cli.run_plan import (
+    expected_frames,
+    services_for,
+    with_own_inventory,
+    with_port,
+    with_recorder,
+    with_state,
+    with_trees,
+)
 from services.cli.spawning import last_line, started
 from services.common.errors import InputError
 from services.station.launch import announce, with_station
@@ -73,7 +81,8 @@ def run(
 
     flags = {"camera.source": source, "simulator.seed": seed, "simulator.scene": scene,
              "navigator.trees_wanted": trees, "navigator.handheld": True if handheld else None}  # fmt: skip
-    tree = with_trees(loaded(config, settings, port, {k: v for k, v in flags.items() if v is not None}).config)
+    found = loaded(config, settings, port, {k: v for k, v in flags.items() if v is not None})
+    tree = with_trees(with_own_inventory(found))
     tree = with_recorder(tree, record, logs)
     expected = expected_frames(tree)
     if parent is not None:
@@ -183,14 +192,14 @@ class Run:
     def _supervised(self, supervisor: Supervisor, stop: StopSignal) -> int:
         from services.cli.status import Status
         from services.cli.watch import Watch
-        from services.common.session import opened_client
+        from services.common.session import opened_node
 
         begin_s = time.monotonic()
         supervisor.check()
         with ExitStack() as stack:
             endpoint = self._tree.router.endpoint
             waiting = self._still_waiting(supervisor, stop)
-            session = stack.enter_context(opened_client(endpoint, waiting, wait_s=_ROUTER_WITHIN_S))
+            session = stack.enter_context(opened_node(self._tree, None, waiting, _ROUTER_WITHIN_S))
             watch = Watch(session, self._tree.uav, lambda h: supervisor.heard(h.service, h.pid, h.state))
             with Status(watch, supervisor, self._console, self._expected) as status:
                 self._console.print(f"treedock: router on {endpoint}, logs in {self._folder}", highlight=False)

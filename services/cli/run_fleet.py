@@ -89,7 +89,7 @@ class FleetRun:
         self, supervisor: Supervisor, flights: dict[str, subprocess.Popen[bytes]], stop: StopSignal, *, browser: bool
     ) -> None:  # fmt: skip
         from services.cli.watch import Watch
-        from services.common.session import opened_client
+        from services.common.session import opened_node
 
         supervisor.check()
 
@@ -99,7 +99,7 @@ class FleetRun:
             return stop.is_set
 
         endpoint = self._ground.router.endpoint
-        with opened_client(endpoint, given_up, wait_s=self._ground.supervisor.start_within_s) as session:
+        with opened_node(self._ground, None, given_up, self._ground.supervisor.start_within_s) as session:
             watch = Watch(session, self._ground.uav, lambda h: supervisor.heard(h.service, h.pid, h.state))
             self._console.print(f"treedock: router on {endpoint}, logs in {self._folder}", highlight=False)
             announce(self._console, self._folder, browser=browser)

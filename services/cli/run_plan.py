@@ -12,6 +12,7 @@ from services.station.launch import station_services
 
 if TYPE_CHECKING:
     from services.common.config import TreedockConfig
+    from services.common.config_loader import LoadedConfig
 
 _TREES_ANYWAY = 2
 """A scene drawn at random holds at least one tree to dock at."""
@@ -35,6 +36,21 @@ def with_trees(tree: TreedockConfig) -> TreedockConfig:
         "simulator": simulator.model_copy(update={"trees": asked, "flight": flight}),
         "supervisor": tree.supervisor.model_copy(update={"mission_within_s": within_s}),
     })  # fmt: skip
+
+
+def with_own_inventory(found: LoadedConfig) -> TreedockConfig:
+    """Return the configuration without the places that this machine's files give the installed station's inventory and book.
+
+    They are that station's: a run has the user's own, or its folder's.
+    """
+    from services.common.config_loader import SYSTEM_DIRECTORY
+
+    station = found.config.station
+    for section, key in (("inventory", "database"), ("fleet", "book")):
+        if Path(found.origins.get(f"station.{section}.{key}", "")).parent == SYSTEM_DIRECTORY:
+            own = getattr(station, section).model_copy(update={key: ""})
+            station = station.model_copy(update={section: own})
+    return found.config.model_copy(update={"station": station})
 
 
 def with_state(tree: TreedockConfig, folder: Path) -> TreedockConfig:

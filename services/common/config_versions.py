@@ -130,7 +130,7 @@ def migrate_file(path: Path) -> str:
         return f"{path}: is of version {NEWEST} already"
     fresh = to_toml({"config_version": NEWEST, **current(body, str(path))}, {})
     kept = path.with_name(f"{path.name}.old")
-    mode = path.stat().st_mode & 0o777
-    write_whole(kept, text.encode(), mode)
-    write_whole(path, fresh.encode(), mode)
+    like = path.stat()  # an administrator's umask and group would keep the services from reading it
+    write_whole(kept, text.encode(), 0o600, like=like)
+    write_whole(path, fresh.encode(), 0o600, like=like)
     return f"{path}: written anew in version {NEWEST}; {kept.name} is the old one, with its comments"

@@ -20,9 +20,10 @@ from services.camera.calibrated import calibrated_on
 from services.common.errors import InputError
 from services.common.memlock import lockable_bytes
 from services.common.version import running_version
-from services.doctor.model import Facts, ServiceFact, VehicleFact
+from services.doctor.model import Facts, ServiceFact, VehicleFact, service_of
 from services.doctor.told import told
 from services.doctor.twins import Twins
+from services.router.radio import absent
 from services.security.identity import STATION
 
 if TYPE_CHECKING:
@@ -38,26 +39,28 @@ def gather(config: TreedockConfig) -> Facts:
     heard = _listen(config)
     folder = config.security.folder
     camera, mbit = _camera(config.camera.source)
+    station = _is_station(config.security.identity)
     return Facts(
         router=None if heard.fault else config.router.endpoint,
         router_fault=heard.fault,
         services=_services(heard),
         vehicle=None if heard.vehicle is None else _vehicle(heard.vehicle),
         version=running_version(),
-        units=_units(),
-        station=_is_station(config.security.identity),
+        units=_units(station=station),
+        station=station,
         certificates=_certificates(folder) if folder else {},
         certificate_faults=_certificate_faults(folder) if folder else (),
         loose_keys=_loose_keys(folder) if folder else (),
         foreign_keys=_foreign_keys(folder) if folder else (),
         encrypted=folder is not None,
+        radio_absent=absent(config.security.radio_interfaces) if folder and not station else (),
         reachable_from_outside=not config.router.local,
         clock_synchronised=_synchronised(),
         lockable_bytes=lockable_bytes(),
         shm_free_bytes=_free(Path("/dev/shm")),
         closed=_closed((folder, config.recorder.folder)),
         disk_reserve_bytes=config.recorder.reserve_mb * 1_000_000,
-        disk_free_bytes=_free(_nearest(config.recorder.folder)),
+        disk_free_bytes=_free(_nearest(config.recorder.folder)) if config.recorder.mcap else None,
         recordings_cut=_cut(config.recorder.folder),
         camera=camera,
         camera_mbit=mbit,
@@ -161,10 +164,19 @@ def _locked_bytes(process: Path) -> int | None:
     return int(words[1]) * 1024 if words else None
 
 
-def _units() -> dict[str, str]:
+def _units(*, station: bool) -> dict[str, str]:
+    """Return the state of the units that are to run here: of those of the other kind of machine, or optional, what does run."""
+    from services.cli.service_command import OPTIONAL
+
     said = _said("systemctl", "list-units", "--all", "--plain", "--no-legend", "treedock*.service")
     rows = [line.split() for line in said.splitlines()]
-    return {row[0]: row[2] for row in rows if len(row) > 2 and row[1] == "loaded"}
+    states = {row[0]: row[2] for row in rows if len(row) > 2 and row[1] == "loaded"}
+
+    def wanted(unit: str) -> bool:
+        name = service_of(unit)
+        return name not in OPTIONAL and (name == STATION) == station
+
+    return {unit: state for unit, state in states.items() if state != "inactive" or wanted(unit)}
 
 
 def _is_station(identity: str) -> bool:

@@ -8,7 +8,8 @@ from pathlib import Path
 from schemas.topics import CAMERA_RGBD
 from services.common.memlock import too_little
 from services.doctor.aboard import aboard, certificate, disk
-from services.doctor.model import Facts, Finding
+from services.doctor.model import Facts, Finding, service_of
+from services.router.radio import in_words
 
 CALIBRATION_WARN_DAYS = 180
 AUTHORITY = "ca"
@@ -21,7 +22,7 @@ LEAST_LOCKED_BYTES = 1_000_000
 
 def judge(facts: Facts) -> list[Finding]:
     """Return the findings, in the order in which a person would go about them."""
-    found = [*_rights(facts), *_units(facts), *_bus(facts), *_security(facts), *_clock(facts)]
+    found = [*_rights(facts), *_units(facts), *_bus(facts), *_security(facts), *_radio(facts), *_clock(facts)]
     return found if facts.station else [*found, *_memory(facts), *_disk(facts), *_camera(facts)]
 
 
@@ -38,10 +39,14 @@ def _units(f: Facts) -> list[Finding]:
         words = ", ".join(f"{name} is {state}" for name, state in sorted(bad.items()))
         first = sorted(bad)[0]
         return [Finding("units", "fail", words, f"journalctl -u {first} -n 50; then systemctl restart {first}")]
-    active = sum(state == "active" for state in f.units.values())
-    if not active:
+    stopped = sorted(name for name, state in f.units.items() if state == "inactive")
+    if len(stopped) == len(f.units):
         return [Finding("units", "warn", "all units are stopped", _start(f))]
-    return [Finding("units", "ok", f"{active} of {len(f.units)} active")]
+    if stopped:
+        words = ", ".join(f"{name} is stopped" for name in stopped)
+        do = f"{_start(f)}; one that is not wanted: sudo systemctl mask {stopped[0]}"
+        return [Finding("units", "warn", words, do)]
+    return [Finding("units", "ok", f"all {len(f.units)} active")]
 
 
 def _bus(f: Facts) -> list[Finding]:
@@ -51,7 +56,13 @@ def _bus(f: Facts) -> list[Finding]:
             do = "is the aircraft on, and the link? is router.host in /etc/treedock the aircraft's address?"
         return [Finding("router", "fail", f.router_fault or f"nobody answers at {f.wanted_router}", do)]
     found = [Finding("router", "ok", f.router), *aboard(f.services, f.vehicle, f.version)]
-    if not f.services:
+    heard = {service.name for service in f.services}
+    silent = sorted({service_of(unit) for unit, state in f.units.items() if state == "active"} - heard)
+    if silent:
+        words = f"{', '.join(silent)}: running, and nothing of it is heard"
+        do = f"are its certificate and this session's valid, and of the same aircraft (uav)? journalctl -u treedock-{silent[0]} -n 50"
+        found.append(Finding("services", "fail", words, do))
+    elif not f.services:
         words = "no service is up" + (", or this certificate is revoked or of another aircraft" if f.encrypted else "")
         found.append(Finding("services", "warn", words, _start(f)))
     return found
@@ -86,6 +97,11 @@ def _security(f: Facts) -> list[Finding]:
     if not found and not f.certificates:
         return [Finding("certificates", "unknown", "they could not be looked at", "sudo treedock doctor")]
     return found or [Finding("certificates", "ok", f"{len(f.certificates)} valid")]
+
+
+def _radio(f: Facts) -> list[Finding]:
+    do = "ip link shows this machine's interfaces; correct security.radio_interfaces in /etc/treedock"
+    return [Finding("radio", "warn", in_words(f.radio_absent), do)] if f.radio_absent else []
 
 
 def _authority(days: float) -> list[Finding]:

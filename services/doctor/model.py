@@ -74,7 +74,7 @@ class Facts:
     version: str = ""
     """Of the treedock that asks."""
     units: Mapping[str, str] = field(default_factory=dict)
-    """Unit name to systemd's ActiveState; empty when none is installed."""
+    """Unit name to systemd's ActiveState, of those that are to run here; empty when none is installed."""
     station: bool = False
     """This machine is a ground station and no aircraft: it has no camera, passes no frames on and records nothing."""
     certificates: Mapping[str, float] = field(default_factory=dict)
@@ -86,6 +86,8 @@ class Facts:
     foreign_keys: Sequence[str] = ()
     """Private keys that the owner of their folder, the services' user, may not read."""
     encrypted: bool = False
+    radio_absent: Sequence[str] = ()
+    """Radio interfaces of the configuration that this machine does not have."""
     reachable_from_outside: bool = False
     clock_synchronised: bool | None = None
     lockable_bytes: int | None = None
@@ -94,6 +96,7 @@ class Facts:
     closed: Sequence[str] = ()
     """Folders that this user may not look into."""
     disk_free_bytes: int | None = None
+    """Of the disk that is recorded on; None also where nothing is recorded (``recorder.mcap``)."""
     disk_reserve_bytes: int = 500_000_000
     """What the recorder leaves free (``recorder.reserve_mb``)."""
     recordings_cut: Sequence[str] = ()
@@ -110,3 +113,8 @@ class Facts:
     """Its age; None: it does not say."""
     real: bool = False
     """The configuration says that a real aircraft is flown."""
+
+
+def service_of(unit: str) -> str:
+    """Return the service that a unit runs: ``slam`` of ``treedock-slam.service``."""
+    return unit.removeprefix("treedock-").removesuffix(".service")

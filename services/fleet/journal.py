@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import logging
 import secrets
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from services.common.errors import InputError
-from services.common.files import make_folder, write_whole
+from services.common.files import locked_beside, write_whole
 from services.fleet.book import Memory
 from services.fleet.config import FleetConfig
 from services.inventory.store import default_path
 
 LOG = logging.getLogger(__name__)
+
+_TAKEN = (
+    "another arbiter keeps this book; a fleet has one: switch station.fleet.enabled off here, or name another file with "
+    "station.fleet.book"
+)
 
 Origin = tuple[float, float, float]
 
@@ -50,7 +54,7 @@ class Journal:
             InputError: another arbiter has it, or the folder cannot be written.
         """
         self._path = path
-        self._lock = _locked(path)
+        self._lock = locked_beside(path, "the fleet's book", _TAKEN)
         found = self._read()
         self.name = found.name if found else f"arbiter-{secrets.token_hex(4)}"
         self.origin_deg = found.origin_deg if found else origin_deg or (0.0, 0.0, 0.0)
@@ -64,7 +68,10 @@ class Journal:
         """
         body: dict[str, Any] = {"format": 1, "name": self.name, "origin_deg": self.origin_deg, "memory": asdict(memory)}
         try:
-            write_whole(self._path, json.dumps(body, indent=1).encode(), mode=0o600)
+            like = (
+                self._path.stat() if self._path.exists() else None
+            )  # the station's, also when an administrator writes
+            write_whole(self._path, json.dumps(body, indent=1).encode(), mode=0o600, like=like)
         except InputError as error:
             raise OSError(errno.EIO, str(error)) from error
 
@@ -93,17 +100,3 @@ class Journal:
         )
         if self._path.exists():
             self._path.replace(kept)
-
-
-def _locked(path: Path) -> TextIO:
-    make_folder(path.parent)
-    lock = (path.parent / f".{path.name}.lock").open("w")
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        lock.close()
-        raise InputError(
-            f"{path}: another arbiter keeps this book; a fleet has one: switch station.fleet.enabled off here, or name "
-            "another file with station.fleet.book"
-        ) from None
-    return lock

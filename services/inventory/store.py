@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 from pathlib import Path
-from typing import Any, Protocol, TextIO
+from typing import Any, Protocol
 
 from services.common.errors import InputError
+from services.common.files import is_there, locked_beside
 from services.inventory.geopackage import GeoPackage
 from services.inventory.values import Changes, Contents, Site
+
+_TAKEN = "another station writes to it; name another with --set station.inventory.database=FILE"
 
 
 class Store(Protocol):
@@ -49,7 +51,7 @@ def open_store(database: str, *, read_only: bool = False) -> Store:
         return PostGis(database, read_only=read_only)
     path = Path(database).expanduser() if database else default_path()
     if read_only:
-        if not path.is_file():
+        if not is_there(path):
             raise InputError(f"inventory {path}: there is no such file; name one with --database FILE")
         return GeoPackage(path, read_only=True)
     return _Locked(path)
@@ -59,7 +61,7 @@ class _Locked(GeoPackage):
     """A GeoPackage that no other station writes to meanwhile."""
 
     def __init__(self, path: Path) -> None:
-        self._lock = _locked(path)
+        self._lock = locked_beside(path, "inventory", _TAKEN)
         try:
             super().__init__(path)
         except InputError:
@@ -70,19 +72,3 @@ class _Locked(GeoPackage):
         """Close the file, then let go of the lock."""
         super().close()
         self._lock.close()
-
-
-def _locked(path: Path) -> TextIO:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        lock = (path.parent / f".{path.name}.lock").open("w")
-    except OSError as error:
-        raise InputError(f"inventory {path}: cannot be written: {error.strerror}") from error
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        lock.close()
-        raise InputError(
-            f"inventory {path}: another station writes to it; name another with --set station.inventory.database=FILE"
-        ) from None
-    return lock

@@ -102,7 +102,7 @@ def _operator(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
     v = b.vehicle
     if v is None:
         return None
-    if v.operator_override and v.engaged_mission_id == w.mission_id:  # an earlier mission's stands until ours engages
+    if v.operator_override and w.engaged:  # an earlier mission's stands until the bridge has taken ours
         return Fault("operator", "release", f"operator took over: {v.note or v.mode}; we are silent")
     if not w.armed or doing == "landing":
         return None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,11 +12,12 @@ from typing import TYPE_CHECKING
 
 from schemas.camera import RgbdFrame
 from schemas.codec import Wire
-from schemas.topics import CAMERA_COMPRESSED, CAMERA_RGBD, TOPICS, VEHICLE_STATE, Topic
+from schemas.topics import ANY, CAMERA_COMPRESSED, CAMERA_RGBD, TOPICS, VEHICLE_STATE, Topic
 from services.common.errors import InputError
 from services.doctor.twins import SINGLE
 from services.recorder.index import summary
 from services.recorder.reader import Recorded, messages
+from services.security.access import may_publish
 
 if TYPE_CHECKING:
     from services.common.bus import Bus
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 
 SENSORS: tuple[Topic, ...] = (CAMERA_RGBD, CAMERA_COMPRESSED, VEHICLE_STATE)
 """What services are fed with; all else they make themselves."""
+_SPEAKER = "camera"
+"""Whose certificate a replay shows."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +48,8 @@ class Played:
     length_s: float = 0.0
     """From the recording's first message of those topics to its end, as far as it is known."""
     faults: list[str] = field(default_factory=list)
+    denied: Counter[str] = field(default_factory=Counter)
+    """Messages by topic that an encrypted bus would not have taken from a camera, and that were not sent."""
 
 
 def check(span: Span) -> None:
@@ -74,11 +80,12 @@ def play(config: TreedockConfig, file: Path, span: Span, *, everything: bool = F
     if first is None:
         raise InputError(f"{file}: it holds nothing to replay; `treedock recordings` shows what is in a file")
     _refuse_beyond(file, span, _length_s(file, first.stamp_ns))
-    with opened_node(config, "camera", lambda: stop.is_set, wait_s=0.0) as session:
+    with opened_node(config, _SPEAKER, lambda: stop.is_set, wait_s=0.0) as session:
         bus = Bus(session, config.uav, HealthBook())
         others = SINGLE if everything else frozenset(topic.producer for topic in SENSORS)
         alone(bus, others)
-        return play_on(bus, file, messages(file, topics), span, stop, others)
+        encrypted = config.security.folder is not None
+        return play_on(bus, file, messages(file, topics), span, stop, others, encrypted=encrypted)
 
 
 def alone(bus: Bus, others: Iterable[str]) -> None:
@@ -109,10 +116,16 @@ def _refuse_beyond(file: Path, span: Span, length_s: float | None) -> None:
         raise InputError(f"--from {span.begin_s:g} s: {file.name} is only {length_s:.1f} s long")
 
 
+def _may_say(entry: Recorded) -> bool:
+    """Whether an encrypted bus takes this from a camera; the router drops all else without a word."""
+    return may_publish(_SPEAKER, entry.topic) and (entry.topic.producer != ANY or entry.leaf == _SPEAKER)
+
+
 def play_on(
-    bus: Bus, file: Path, entries: Iterable[Recorded | str], span: Span, stop: StopSignal, others: Iterable[str]
-) -> Played:
-    """Play what ``file`` holds, ``entries``, onto the bus.
+    bus: Bus, file: Path, entries: Iterable[Recorded | str], span: Span, stop: StopSignal, others: Iterable[str], *,
+    encrypted: bool = False,
+) -> Played:  # fmt: skip
+    """Play what ``file`` holds, ``entries``, onto the bus; where that is ``encrypted``, what a camera may say.
 
     Raises:
         InputError: the file ends before the span begins, or one of ``others`` was started.
@@ -134,6 +147,9 @@ def play_on(
             continue
         if stop.is_set or (span.end_s is not None and at_s > span.end_s):
             break
+        if encrypted and not _may_say(entry):
+            played.denied[entry.topic.name] += 1
+            continue
         due_s = begin_s + (at_s - span.begin_s) / span.rate
         if (wait_s := due_s - time.monotonic()) > 0 and stop.wait(wait_s):
             break

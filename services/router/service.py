@@ -15,6 +15,7 @@ from services.common.runtime import run_service
 from services.common.session import memory_settings, opened, router_config, split_endpoint, why_not_listen
 from services.common.stop import StopSignal
 from services.router.keeper import TimeKeeper
+from services.router.radio import RadioWatch
 from services.router.watch import RegisterWatch
 from services.security.transport import router_settings
 
@@ -59,6 +60,8 @@ def run(config: TreedockConfig, stop: StopSignal | None = None) -> int:
 
     def build(context: LiveContext) -> None:
         watch.register(context)
+        if config.security.folder is not None:  # on a plain bus nothing is held back anywhere
+            RadioWatch(config.security.radio_interfaces).register(context)
         TimeKeeper(context, context.wall)
 
     return run_service("router", build, config, stop, session=lambda _: listening(config))

@@ -145,15 +145,15 @@ def _advanced(keys: Iterable[str]) -> tuple[str, ...]:
 def radio_rules(interfaces: Sequence[str], topics: Sequence[Topic] = TOPICS) -> dict[str, object]:
     """Return Zenoh's sections that hold back what passes the radio: size limit and thinning.
 
-    That host and aircraft keys never leave is the access control's work: no station has a right to them.
+    Of what stays aboard nothing passes. No station has a right to it, but tools and recorders of the aircraft have, and
+    they may listen from the ground.
     """
     if not interfaces:
         return {}
     thinned = [{"key_expr": t.key("*"), "freq": t.radio_hz} for t in topics if t.radio_hz > 0]
     sizes: dict[int, list[str]] = {}
     for topic in topics:
-        if topic.reach is Reach.RADIO:
-            sizes.setdefault(topic.max_bytes, []).append(topic.key("*"))
+        sizes.setdefault(topic.max_bytes if topic.reach is Reach.RADIO else 0, []).append(topic.key("*"))
     at = {"interfaces": list(interfaces), "flows": ["egress"]}
     return {
         "downsampling": [{"id": "radio", **at, "messages": ["put"], "rules": thinned}],

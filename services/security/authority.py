@@ -163,7 +163,11 @@ class Authority:
         make_folder(folder, 0o700)
         pairs = [f"{identity.text}{end}" for identity in identities for end in (".pem", ".key")]
         files = []
-        for name in (CA_CERTIFICATE, Register.FILE, *pairs):
+        for name in (
+            CA_CERTIFICATE,
+            *pairs,
+            Register.FILE,
+        ):  # a router may look here: first the pairs, then who has rights
             try:
                 body = (self.folder / name).read_bytes()
             except OSError as error:

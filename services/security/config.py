@@ -17,4 +17,5 @@ class SecurityConfig(BaseModel):
     identity: str = Field(default="", pattern=r"^([A-Za-z0-9_-]+\.[A-Za-z0-9_.-]+)?$", max_length=64)
     """Whose certificate is shown; empty: a service shows ``{uav}.{service}``, a tool of the command line ``{uav}.reader``."""
     radio_interfaces: tuple[str, ...] = ()
-    """Network interfaces of the router behind which the radio lies: keys are thinned and held small there."""
+    """Network interfaces of the router behind which the radio lies: keys are thinned and held small there, and
+    what is to stay aboard does not pass."""

@@ -24,18 +24,34 @@ class Expiry:
     """
 
     def __init__(self, security: SecurityConfig, uav: str, service: str) -> None:
+        self._folder = security.folder
+        self._identity = "" if self._folder is None else shown_by(security, uav, service).text
         self._until: dt.datetime | None = None
-        if security.folder is None:
-            return
-        try:
-            self._until = Register.read(security.folder).valid_until(shown_by(security, uav, service).text)
-        except InputError as error:
-            LOG.warning("when the certificate ends cannot be told: %s", error)
+        self._read_of: tuple[int, int] | None = None
+        self._look()
 
     def tell(self, book: HealthBook, now: dt.datetime) -> None:
-        """Put the minutes left into health; nothing where none is known."""
+        """Put the minutes left into health; nothing where none is known. A renewal since the last time counts."""
+        self._look()
         if self._until is not None:
             book.level(_LEFT, int((self._until - now).total_seconds() // 60))
+
+    def _look(self) -> None:
+        """Read the list where it is another than last time; one that cannot be read changes nothing."""
+        if self._folder is None:
+            return
+        try:
+            status = (self._folder / Register.FILE).stat()
+            found = (status.st_mtime_ns, status.st_ino)
+        except OSError:
+            found = (0, 0)  # told by who reads it
+        if found == self._read_of:
+            return
+        self._read_of = found
+        try:
+            self._until = Register.read(self._folder).valid_until(self._identity)
+        except InputError as error:
+            LOG.warning("when the certificate ends cannot be told: %s", error)
 
 
 def told_days_left(counters: Mapping[str, int]) -> float | None:

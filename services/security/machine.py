@@ -6,6 +6,7 @@ import contextlib
 import datetime as dt
 import os
 from collections.abc import Collection
+from dataclasses import dataclass
 from pathlib import Path
 
 from cryptography import x509
@@ -19,10 +20,23 @@ from services.security.identity import Identity
 from services.security.register import Register
 
 
-def bring(source: Path, to: Path, now: dt.datetime) -> list[Path]:
+@dataclass(frozen=True, slots=True)
+class Brought:
+    """What an import did to the machine's folder."""
+
+    files: tuple[Path, ...]
+    changed: tuple[Identity, ...]
+    """Of those whose other pair was there before: what runs with them shows the old one until it connects anew."""
+    revoked: tuple[str, ...]
+    """Identities that hold no certificate any more: their pairs were left out, and removed where they were here."""
+
+
+def bring(source: Path, to: Path, now: dt.datetime) -> Brought:
     """Copy what ``certs export`` put into ``source`` to this machine's folder, after looking at all of it.
 
-    The files belong to the folder's owner afterwards (the services' user), also when an administrator brings them.
+    The files belong to the folder's owner afterwards (the services' user), also when an administrator brings them. The list
+    comes last: a router that runs starts anew with it, and whoever then connects again has to find the pair that it names.
+    A revoked pair whose identity holds no other is passed over, and taken away where it was here: no export replaces it.
 
     Raises:
         InputError: something is missing, damaged, expired, revoked or of another authority, or older than what the machine
@@ -35,25 +49,57 @@ def bring(source: Path, to: Path, now: dt.datetime) -> list[Path]:
     authority = _certificate(source / CA_CERTIFICATE)
     register = Register.read(source)
     valid = register.valid_names()
-    names = [CA_CERTIFICATE, Register.FILE]
-    for path in sorted(source.glob("*.pem")):
-        if path.name == CA_CERTIFICATE:
+    names, changed = [CA_CERTIFICATE], []
+    ended = [path for folder in (source, to) for path in _pairs(folder) if _ended(path, register)]
+    for path in _pairs(source):
+        if path in ended:
             continue
         certificate = _check(path, authority, valid)
         if certificate.not_valid_after_utc <= now:
             end = f"{certificate.not_valid_after_utc:%Y-%m-%d}"
             raise InputError(f"{path}: expired on {end}; `treedock certs renew` first")
         names += [path.name, path.with_suffix(".key").name]
+        if _another(path, to / path.name):
+            changed.append(Identity.parse(path.stem))
+    names.append(Register.FILE)
     _check_later(to, authority, register, names, source)
     make_folder(to, 0o700)
     owner = to.stat()
-    files = []
     for name in names:
         write_whole(to / name, (source / name).read_bytes(), 0o600 if name.endswith(".key") else 0o644)
         with contextlib.suppress(PermissionError):  # only root may give files away, and only root needs to
             os.chown(to / name, owner.st_uid, owner.st_gid)
-        files.append(to / name)
-    return files
+    for path in ended:
+        if path.parent == to:
+            path.unlink()
+            path.with_suffix(".key").unlink(missing_ok=True)
+    return Brought(tuple(to / name for name in names), tuple(changed), tuple(sorted({path.stem for path in ended})))
+
+
+def _pairs(folder: Path) -> list[Path]:
+    """Return the certificates of nodes in a folder."""
+    return [path for path in sorted(folder.glob("*.pem")) if path.name != CA_CERTIFICATE]
+
+
+def _ended(path: Path, register: Register) -> bool:
+    """Return whether a certificate is revoked, and its identity holds no later one that an export would bring."""
+    try:
+        name = _name(_certificate(path))
+    except InputError:  # damaged: told where it is checked
+        return False
+    entry = next((entry for entry in register.entries if entry.common_name == name), None)
+    return entry is not None and register.valid_until(entry.identity) is None
+
+
+def _name(certificate: x509.Certificate) -> str:
+    return str(certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)[0].value)
+
+
+def _another(path: Path, there: Path) -> bool:
+    try:
+        return there.read_bytes() != path.read_bytes()
+    except OSError:
+        return False
 
 
 def _check_later(
@@ -88,7 +134,7 @@ def faults_in(folder: Path) -> list[str]:
         authority, valid = _certificate(folder / CA_CERTIFICATE), Register.read(folder).valid_names()
     except InputError as error:
         return [str(error)]
-    pairs = [path for path in sorted(folder.glob("*.pem")) if path.name != CA_CERTIFICATE]
+    pairs = _pairs(folder)
     faults = [] if pairs else [f"{folder}: holds no node's certificate"]
     for path in pairs:
         try:
@@ -104,9 +150,11 @@ def _check(path: Path, authority: x509.Certificate, valid: dict[str, Identity]) 
         certificate.verify_directly_issued_by(authority)
     except (InvalidSignature, ValueError, TypeError):
         raise InputError(f"{path}: is of another authority than the {CA_CERTIFICATE} beside it") from None
-    name = str(certificate.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)[0].value)
+    name = _name(certificate)
     if name not in valid:
-        raise InputError(f"{path}: {name} is revoked or not in {Register.FILE}; export it again")
+        held = path.stem in {identity.text for identity in valid.values()}
+        do = "export it again" if held else f"remove it (rm {path} {path.with_suffix('.key')}), or issue and export it"
+        raise InputError(f"{path}: {name} is revoked or not in {Register.FILE}; {do}")
     if valid[name].text != path.stem:
         raise InputError(f"{path}: is the certificate of {valid[name].text}; export {path.stem} again")
     key = path.with_suffix(".key")

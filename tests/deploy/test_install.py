@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,6 +18,7 @@ from schemas.topics import TOPICS
 from services.cli.service_command import OPTIONAL, SERVICES
 from services.common.config_loader import load
 from services.common.errors import InputError
+from services.fleet.journal import book_path
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "deploy"))
@@ -206,8 +208,47 @@ def test_every_commented_block_can_be_uncommented_as_it_is_meant(tmp_path: Path,
         tree = load(path, environ={}, system_directory=tmp_path / "none").config
         for table, values in tomllib.loads(path.read_text()).items():
             if isinstance(values, dict):
-                told = getattr(tree, table).model_dump(mode="json", include=set(values))
-                assert told == values, f"{chosen}: [{table}]"
+                told = getattr(tree, table).model_dump(mode="json")
+                assert told == merged(told, values), f"{chosen}: [{table}]"
+
+
+def merged(under: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Return ``under`` with the values of ``over``, section by section."""
+    return under | {k: merged(under[k], v) if isinstance(v, dict) else v for k, v in over.items()}
+
+
+def test_an_installed_stations_files_do_not_depend_on_who_asks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    staged(tmp_path, "--role", "station")
+    monkeypatch.delenv("XDG_DATA_HOME", raising=False)
+    places = set()
+    for home in ("/root", "/var/lib/treedock"):
+        monkeypatch.setenv("HOME", home)
+        station = load(environ={}, system_directory=tmp_path / "etc/treedock").config.station
+        places.add((station.inventory.database, str(book_path(station.fleet))))
+    state = next(unit.state for unit in units.UNITS if unit.ground).split()[-1]
+    folder = f"/var/lib/{state}"
+    assert places == {(f"{folder}/inventory.gpkg", f"{folder}/fleet.json")}
+
+
+def test_data_of_an_older_station_are_told_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    old, config = tmp_path / installer.HOME_DATA, tmp_path / installer.CONFIG
+    old.mkdir(parents=True)
+    (old / "inventory.gpkg").touch()
+    staged(tmp_path, "--role", "station")
+
+    def note() -> str:
+        assert installer.main(["--root", str(tmp_path), "--role", "station", "--dry-run"]) == 0
+        return capsys.readouterr().out.partition("note: ")[2]
+
+    assert f"mv {old / 'inventory.gpkg'}* /var/lib/treedock/inventory/" in note()
+    config.write_text('uav = "uav1"\n')
+    told = note()
+    assert f"add to {config}" in told
+    config.write_text("\n".join(line.strip() for line in told.splitlines()[1:]))
+    assert load(environ={}, system_directory=config.parent).config.station.inventory.database == str(
+        old / "inventory.gpkg"
+    )
+    assert note() == ""
 
 
 def test_again_changes_nothing_and_keeps_the_administrators_file(tmp_path: Path) -> None:

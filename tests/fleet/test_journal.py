@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from pathlib import Path
 
 import pytest
 
 from schemas.fleet import ClaimGoal
+from services.cli.app import invoke
 from services.cli.fleet import forget, list_book
 from services.common.errors import InputError
 from services.fleet.book import Done, Lease, Memory
@@ -39,6 +41,50 @@ def test_a_second_arbiter_is_refused_the_book(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="another arbiter keeps this book"):
         Journal(tmp_path / "fleet.json", ORIGIN)
     first.close()
+
+
+def test_a_lock_that_cannot_be_opened_is_told_with_its_name(tmp_path: Path) -> None:
+    (tmp_path / ".fleet.json.lock").mkdir()  # for root, too; others see the like of one that root made
+    with pytest.raises(InputError, match=r"\.fleet\.json\.lock cannot be opened"):
+        Journal(tmp_path / "fleet.json", ORIGIN)
+
+
+@pytest.mark.parametrize("word", ["forget", "list"])
+def test_where_there_is_no_book_the_operator_is_told_so(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], word: str
+) -> None:
+    book = tmp_path / "of-somebody-else/fleet.json"
+    assert invoke(["fleet", word, "--set", f"station.fleet.book={book}"]) == 2
+    assert str(book) in capsys.readouterr().err
+    assert not book.parent.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "key"), [(["fleet", "forget"], "fleet.book"), (["inventory", "show"], "inventory.database")]
+)
+def test_a_user_who_may_not_look_there_is_told_so(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, words: list[str], key: str
+) -> None:
+    """The installed station's folder is closed to others, who are no bug."""
+
+    def closed(path: Path) -> bool:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "is_file", closed)
+    assert invoke([*words, "--set", f"station.{key}=/nowhere/file"]) == 2
+    assert "/nowhere/file: this user may not look there; sudo" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
+def test_what_an_administrator_does_with_the_book_leaves_it_to_the_station(tmp_path: Path) -> None:
+    os.chown(tmp_path, 4711, 4711)
+    path = tmp_path / "fleet.json"
+    journal = Journal(path, ORIGIN)
+    journal.write(MEMORY)
+    journal.close()
+    os.chown(path, 4711, 4711)
+    forget(config=None, settings=[f"station.fleet.book={path}"])
+    assert {file.stat().st_uid for file in tmp_path.iterdir()} == {4711}
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
-from schemas.topics import PREVIEW_IMAGE, SLAM_POSE
+from schemas.topics import CAMERA_RGBD, PREVIEW_IMAGE, SLAM_KEYFRAME, SLAM_POSE
 from services.common.session import free_port, opened, opened_client, router_config
 from services.security.access import radio_rules
 
@@ -40,10 +40,17 @@ def test_poses_are_thinned_and_what_is_too_big_stays_aboard(endpoint: str) -> No
             sent += 1
             time.sleep(0.01)
         aircraft.put(PREVIEW_IMAGE.key("uav1"), bytes(PREVIEW_IMAGE.max_bytes + 1))
+        for kept in (
+            CAMERA_RGBD,
+            SLAM_KEYFRAME,
+        ):  # a tool's or recorder's certificate lets it listen from the ground, too
+            aircraft.put(kept.key("uav1"), b"x")
         aircraft.put(PREVIEW_IMAGE.key("uav2"), bytes(PREVIEW_IMAGE.max_bytes))
         limit = time.monotonic() + 5.0
         while PREVIEW_IMAGE.key("uav2") not in heard and time.monotonic() < limit:
             time.sleep(0.05)
+    assert CAMERA_RGBD.key("uav1") not in heard
+    assert SLAM_KEYFRAME.key("uav1") not in heard
     poses = len(heard[SLAM_POSE.key("uav1")])
     assert sent > 3 * SLAM_POSE.radio_hz * SECONDS, "there was something to thin"
     assert 1 <= poses <= SLAM_POSE.radio_hz * SECONDS * 1.2 + 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import os
 import subprocess
 import sys
@@ -17,11 +18,15 @@ from services.cli import run as run_module
 from services.cli import scratch
 from services.cli.mission import Conductor, Flown, prepared
 from services.cli.run import Run
-from services.cli.run_plan import services_for, with_trees
+from services.cli.run_fleet import FleetRun
+from services.cli.run_plan import services_for, with_own_inventory, with_trees
 from services.common.config import TreedockConfig
+from services.common.config_loader import load
 from services.common.errors import InputError
 from services.common.stop import StopSignal
 from services.evaluate.flown import mission_figures
+from services.security.authority import Authority
+from services.security.identity import READER, Identity
 from services.simulator.catalogue import scene_for, trees_to_ask_for
 from tests.unit.test_common_supervisor import Bench
 
@@ -73,6 +78,46 @@ def test_folders_of_killed_runs_are_cleared_away_and_no_others(tmp_path: Path) -
     (tmp_path / "treedock-run-kept").mkdir()
     assert [p.name for p in scratch.clear_stale(tmp_path)] == ["treedock-run-dead"]
     assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_a_run_keeps_out_of_the_installed_stations_inventory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Trees of a simulation would lie among the real ones."""
+    text = '[station]\ninventory.database = "/installed.gpkg"\nfleet.book = "/installed.json"\n'
+    (tmp_path / "10-treedock.toml").write_text(text)
+    monkeypatch.setattr("services.common.config_loader.SYSTEM_DIRECTORY", tmp_path)
+    station = with_own_inventory(load(environ={}, system_directory=tmp_path)).station
+    assert (station.inventory.database, station.fleet.book) == ("", "")
+    asked = load(flags=["station.inventory.database=mine.gpkg"], environ={}, system_directory=tmp_path)
+    assert with_own_inventory(asked).station.inventory.database == "mine.gpkg"
+
+
+@pytest.mark.parametrize("fleet", [False, True])
+def test_a_run_joins_an_encrypted_bus_by_its_certificate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, fleet: bool
+) -> None:
+    """Refused before: `does it want certificates`, with a router of its own that wanted them."""
+    names = [f"uav1.{READER}", f"ground.{READER}"]
+    authority = Authority.create(tmp_path / "certs", dt.datetime.now(dt.UTC))
+    for name in names:
+        authority = authority.issue(Identity.parse(name), dt.datetime.now(dt.UTC))
+    tree = TreedockConfig.model_validate(
+        {"camera": {"source": "sim"}, "router": {"protocol": "tls"}, "security": {"folder": tmp_path / "certs"}}
+    )
+    shown: list[object] = []
+
+    def opened(*given: Any, **_: object) -> None:
+        shown.append(given[3]["transport/link/tls/connect_certificate"] if len(given) > 3 else None)
+        raise InputError("seen enough")
+
+    monkeypatch.setattr("services.common.session.opened_client", opened)
+    monkeypatch.setattr("services.cli.supervisor.Supervisor.check", lambda _: None)
+    console = Console(quiet=True)
+    run: Run | FleetRun = Run(lambda: tree, console, tmp_path / "logs", None, as_json=False, browser=False)
+    if fleet:
+        run = FleetRun(tree, 2, console, tmp_path / "logs", None, fixed_port=True)
+    with pytest.raises(InputError, match="seen enough"):
+        run.to_the_end() if isinstance(run, Run) else run.to_the_end(as_json=False, browser=False)
+    assert shown == [str(tmp_path / "certs" / f"{names[fleet]}.pem")]
 
 
 def test_a_port_lost_to_another_process_is_chosen_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

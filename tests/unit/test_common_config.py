@@ -333,6 +333,24 @@ def test_migration_writes_the_file_anew_and_keeps_the_old_one(
     assert "already" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("mode", [0o644, 0o640])
+def test_a_migrated_file_is_readable_for_whom_it_was(tmp_path: Path, mode: int) -> None:
+    """As root with a strict umask: the services, in the file's group, read it afterwards too."""
+    path = write(tmp_path, "a.toml", OLD)
+    path.chmod(mode)
+    owner = (0, 4711) if os.geteuid() == 0 else (os.geteuid(), os.getegid())
+    os.chown(path, *owner)
+    before = os.umask(0o077)
+    try:
+        migrate_file(path)
+    finally:
+        os.umask(before)
+    for file in (path, tmp_path / "a.toml.old"):
+        status = file.stat()
+        assert status.st_mode & 0o777 == mode
+        assert (status.st_uid, status.st_gid) == owner
+
+
 def test_a_failed_migration_leaves_the_file_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path, "a.toml", OLD)
 

@@ -49,11 +49,15 @@ CAMERA = ServiceFact(
 SLAM = ServiceFact("slam", "ready", 11, "", 0.2, {"slam/pose": 15.0}, clock_offset_s=0.001)
 SOUND = Facts(
     router="tcp/127.0.0.1:7447", wanted_router="tcp/127.0.0.1:7447", services=(CAMERA, SLAM),
-    units={"treedock-slam.service": "active"}, clock_synchronised=True, lockable_bytes=-1, shm_free_bytes=10**10,
+    units={"treedock-camera.service": "active", "treedock-slam.service": "active"}, clock_synchronised=True, lockable_bytes=-1, shm_free_bytes=10**10,
     version="0.1.0+same", disk_free_bytes=10**11, camera="realsense: 4 video devices", source="realsense", calibration_days=20.0,
 )  # fmt: skip
 PX4 = ServiceFact("autopilot", "ready", 12, "", 0.2, {"vehicle/state": 20.0})
-FLYING = replace(SOUND, services=(CAMERA, SLAM, PX4), vehicle=VehicleFact(connected=True, note="", battery_share=0.8))
+FLYING = replace(
+    SOUND, services=(CAMERA, SLAM, PX4), vehicle=VehicleFact(connected=True, note="", battery_share=0.8),
+    units={**SOUND.units, "treedock-autopilot.service": "active"},
+)  # fmt: skip
+STOPPED = {"treedock-slam.service": "inactive"}
 WRONG = "parameters: EKF2_EV_CTRL is 0, expected 11: fuse vision position, height and yaw"
 ENCRYPTED = replace(SOUND, encrypted=True, certificates={"uav1.slam": 200.0}, reachable_from_outside=True)
 
@@ -67,10 +71,13 @@ def test_a_sound_machine_has_no_trouble() -> None:
     ("facts", "about", "level", "word"),
     [
         (replace(SOUND, router=None, services=()), "router", "fail", "7447"),
-        (replace(SOUND, services=()), "services", "warn", "no service"),
-        (replace(ENCRYPTED, services=()), "services", "warn", "or this certificate is revoked"),
+        (replace(SOUND, services=(), units=STOPPED), "services", "warn", "no service"),
+        (replace(ENCRYPTED, services=(), units=STOPPED), "services", "warn", "or this certificate is revoked"),
+        (replace(SOUND, services=(CAMERA,)), "services", "fail", "slam: running, and nothing of it is heard"),
+        (replace(SOUND, services=()), "services", "fail", "camera, slam: running"),
+        (replace(FLYING, units={**FLYING.units, **STOPPED}), "units", "warn", "treedock-slam.service is stopped"),
         (replace(SOUND, units={"treedock-slam.service": "failed"}), "units", "fail", "treedock-slam"),
-        (replace(SOUND, units={"treedock-slam.service": "inactive"}), "units", "warn", "stopped"),
+        (replace(SOUND, units=STOPPED), "units", "warn", "all units are stopped"),
         (replace(SOUND, units={}), "units", "unknown", "no treedock unit"),
         (replace(SOUND, services=(replace(SLAM, age_s=9.0),)), "slam", "fail", "silent"),
         (replace(SOUND, services=(replace(SLAM, state="degraded", note="lost"),)), "slam", "warn", "lost"),
@@ -140,6 +147,7 @@ def test_a_sound_machine_has_no_trouble() -> None:
         ),
         (replace(ENCRYPTED, certificate_faults=("a.pem: damaged",)), "certificate", "fail", "a.pem: damaged"),
         (replace(ENCRYPTED, certificates={}), "certificates", "unknown", "could not be looked at"),
+        (replace(ENCRYPTED, radio_absent=("wlan7",)), "radio", "warn", "wlan7: no network interface here"),
         (replace(ENCRYPTED, loose_keys=("/etc/x.key",)), "keys", "fail", "/etc/x.key"),
         (replace(ENCRYPTED, foreign_keys=("/etc/x.key",)), "keys", "fail", "services' user"),
     ],
@@ -152,7 +160,7 @@ def test_each_trouble_has_its_finding_and_what_to_do(facts: Facts, about: str, l
 
 
 STATION = replace(
-    ENCRYPTED, station=True, services=(SLAM,), camera=None, source="realsense", disk_free_bytes=10**7, shm_free_bytes=10**7,
+    ENCRYPTED, station=True, services=(SLAM, replace(SLAM, name="station", rates_hz={})), camera=None, source="realsense", disk_free_bytes=10**7, shm_free_bytes=10**7,
     units={"treedock-station.service": "active"},
 )  # fmt: skip
 
@@ -168,7 +176,11 @@ def test_a_station_is_not_asked_for_a_camera_or_a_disk_to_record_on() -> None:
     ("facts", "about", "do"),
     [
         (replace(STATION, units={"treedock-station.service": "inactive"}), "units", "start treedock-station.target"),
-        (replace(STATION, services=()), "services", "start treedock-station.target"),
+        (
+            replace(STATION, services=(), units={"treedock-station.service": "inactive"}),
+            "services",
+            "start treedock-station.target",
+        ),
         (replace(STATION, router=None, router_fault="nobody answers"), "router", "router.host"),
     ],
 )

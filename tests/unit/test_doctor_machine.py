@@ -11,15 +11,19 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from services.cli.app import invoke
 from services.cli.doctor import _mended
 from services.common.config import TreedockConfig
+from services.common.context import HealthBook
 from services.doctor.facts import gather
 from services.doctor.findings import judge
 from services.recorder.config import RecorderConfig
+from services.router.radio import RadioWatch
 from services.security.authority import Authority
 from services.security.identity import Identity
 from tests.unit.test_doctor import SOUND
@@ -92,6 +96,9 @@ def test_a_machine_is_really_looked_at(tmp_path: Path) -> None:
     assert facts.recordings_cut == [str(recordings / "a.mcap")]
     assert facts.camera is None
     assert facts.disk_free_bytes is not None
+    without = config.recorder.model_copy(update={"mcap": False})
+    none = gather(config.model_copy(update={"recorder": without})).disk_free_bytes
+    assert none is None, "the doctor's own advice to a full disk: nothing is recorded there"
 
 
 def _nothing(folder: Path) -> None:
@@ -149,6 +156,32 @@ def test_a_system_that_does_not_answer_is_no_bug(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("subprocess.run", run)
     facts = gather(TreedockConfig.model_validate({"router": {"port": 1}}))
     assert (facts.units, facts.clock_synchronised, facts.station) == ({}, None, False)
+
+
+@pytest.mark.parametrize(("identity", "wanted"), [("", {"slam", "recorder"}), ("station.alice", {"slam", "station"})])
+def test_units_that_are_not_to_run_here_are_not_missed(
+    monkeypatch: pytest.MonkeyPatch, identity: str, wanted: set[str]
+) -> None:
+    states = {"slam": "active", "recorder": "inactive", "station": "inactive", "fusion": "inactive"}
+    listed = "".join(f"treedock-{name}.service loaded {state} dead what it is\n" for name, state in states.items())
+    listed += "treedock-gone.service not-found inactive dead\n"
+    monkeypatch.setattr("services.doctor.facts._said", lambda *words: listed if "list-units" in words else "")
+    config = TreedockConfig.model_validate({"router": {"port": 1}, "security": {"identity": identity}})
+    assert set(gather(config).units) == {f"treedock-{name}.service" for name in wanted}
+
+
+def test_a_radio_that_is_not_there_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    names = {"folder": tmp_path, "radio_interfaces": ["lo", "wlan77"]}
+    config = TreedockConfig.model_validate({"router": {"protocol": "tls", "port": 1}, "security": names})
+    assert gather(config).radio_absent == ["wlan77"]
+    looks = list[Callable[[], None]]()
+    context: Any = SimpleNamespace(health=HealthBook(), every_wall=lambda _, look: looks.append(look))
+    RadioWatch(config.security.radio_interfaces).register(context)
+    looks[0]()
+    assert "wlan77: no network interface here" in context.health.notes["radio"]
+    assert caplog.text.count("wlan77") == 1
+    RadioWatch(("lo",)).register(context)
+    assert "radio" not in context.health.notes
 
 
 def test_what_could_not_be_mended_is_not_called_fixed(

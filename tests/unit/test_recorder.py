@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -12,7 +13,7 @@ from mcap.reader import make_reader
 
 from schemas.camera import RgbdFrame
 from schemas.slam import Pose
-from schemas.topics import CAMERA_COMPRESSED, HEALTH, SLAM_POSE, TOPICS, TREES_LIST
+from schemas.topics import CAMERA_COMPRESSED, CAMERA_RGBD, HEALTH, SLAM_POSE, TOPICS, TREES_LIST, VEHICLE_STATE, Topic
 from services.camera.codecs import decode_depth_raw
 from services.camera.config import CameraConfig
 from services.camera.depth.config import DepthConfig
@@ -165,6 +166,43 @@ def test_a_replay_of_nothing_says_how_long_the_recording_is(tmp_path: Path) -> N
     assert said(path, late, played(path, late)).endswith("; the recording is only 0.7 s long")
     last = Span(0.7)
     assert "long" not in said(path, last, played(path, last))
+
+
+def test_on_an_encrypted_bus_a_replay_names_what_it_may_not_say(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The router drops it without a word, and the count said that all was sent."""
+    path, sent = recorded(tmp_path), list[tuple[str, str | None]]()
+    sessions: list[str] = []
+
+    class Listener:
+        uav = "uav1"
+
+        def __init__(self, *_: object) -> None: ...
+
+        def alive(self, _: str) -> bool:
+            return False
+
+        def publish(self, topic: Topic, _: object, leaf: str | None) -> None:
+            sent.append((topic.name, leaf))
+
+    def opened(_: object, service: str, *__: object, **___: object) -> contextlib.nullcontext[None]:
+        sessions.append(service)
+        return contextlib.nullcontext()
+
+    monkeypatch.setattr("services.common.bus.Bus", Listener)
+    monkeypatch.setattr("services.common.session.opened_node", opened)
+    encrypted = ["--set", f"security.folder={tmp_path}", "--set", "router.protocol=tls"]
+    assert invoke(["replay", str(path), "--everything", *encrypted, "--rate", "100"]) == 0
+    assert sessions == ["camera"]
+    assert {name for name, _ in sent} == {CAMERA_RGBD.name}
+    words = capsys.readouterr().err
+    assert "12 of slam/pose" in words
+    assert "12 of vehicle/state: on an encrypted bus" in words
+    sent.clear()
+    assert invoke(["replay", str(path), "--everything", "--rate", "100"]) == 0
+    assert {name for name, _ in sent} >= {CAMERA_RGBD.name, SLAM_POSE.name, VEHICLE_STATE.name}
+    assert "left out" not in capsys.readouterr().err
 
 
 def played(path: Path, span: Span) -> Played:

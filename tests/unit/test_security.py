@@ -8,6 +8,7 @@ import stat
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 from cryptography import x509
@@ -17,10 +18,12 @@ from hypothesis import strategies as st
 from schemas.topics import TOPICS, Delivery, Reach, find
 from services.cli.app import invoke
 from services.common.config_loader import load
+from services.common.context import HealthBook
 from services.common.errors import InputError
 from services.security.access import access_control, radio_rules, rights_of
 from services.security.authority import Authority
 from services.security.config import SecurityConfig
+from services.security.expiry import Expiry, told_days_left
 from services.security.identity import ROLES, Identity
 from services.security.register import Register
 from services.security.transport import node_settings, pair_of, router_settings
@@ -98,7 +101,12 @@ def test_radio_rules_thin_and_limit_what_the_table_names() -> None:
     rules = radio_rules(("wlan0",))
     text = json.dumps(rules)
     assert '"key_expr": "treedock/v1/*/slam/pose", "freq": 5' in text
-    assert "camera/rgbd" not in text
+    limits = {
+        key: rule["size_limit"] for rule in cast("list[Any]", rules["low_pass_filter"]) for key in rule["key_exprs"]
+    }
+    assert {topic.key("*") for topic in TOPICS if limits[topic.key("*")] == 0} == {
+        topic.key("*") for topic in TOPICS if topic.reach is not Reach.RADIO
+    }
     assert find("slam/pose").max_bytes <= 64 * 1024
 
 
@@ -246,3 +254,21 @@ def test_two_who_issue_at_once_lose_no_entry(fleet: Path) -> None:
     running = [subprocess.Popen([*command, name], cwd=ROOT, stdout=subprocess.DEVNULL) for name in names]
     assert [process.wait() for process in running] == [0] * len(names)
     assert set(names) <= {entry.identity for entry in Register.read(fleet).entries}
+
+
+def test_health_tells_the_end_of_a_certificate_that_was_renewed_since(tmp_path: Path) -> None:
+    slam, book = Identity.parse("uav1.slam"), HealthBook()
+
+    def told(expiry: Expiry) -> float:
+        expiry.tell(book, NOW)
+        return told_days_left(book.counters) or 0.0
+
+    authority = Authority.create(tmp_path, NOW).issue(slam, NOW, days=1)
+    expiry = Expiry(SecurityConfig(folder=tmp_path), "uav1", "slam")
+    assert told(expiry) == pytest.approx(1.0, abs=0.001)
+    whole = (tmp_path / Register.FILE).read_text()
+    (tmp_path / Register.FILE).write_text("half of it")
+    assert told(expiry) == pytest.approx(1.0, abs=0.001)
+    (tmp_path / Register.FILE).write_text(whole)
+    authority.issue(slam, NOW, days=397)
+    assert told(expiry) > 300.0
