@@ -15,7 +15,7 @@ from services.inventory.values import Belief
 Array = NDArray[np.float64]
 
 _GATE_SIGMAS = 3.0
-_GATE_MAX_M = 0.75
+GATE_MAX_M = 0.75
 """However doubtful two positions are: trees stand farther apart."""
 _SIGMA_FLOOR_M = 0.02
 _RADIUS_FLOOR_M = 0.004
@@ -37,15 +37,24 @@ class Spots:
         table = np.array(rows, dtype=np.float64).reshape(-1, 5)
         return Spots(table[:, :2], table[:, 2], table[:, 3], table[:, 4])
 
+    def at(self, rows: NDArray[np.int64]) -> Spots:
+        """Return some of the trees."""
+        return Spots(self.xy_m[rows], self.radius_m[rows], self.sigma_xy_m[rows], self.sigma_radius_m[rows])
+
     def __len__(self) -> int:
         return len(self.radius_m)
+
+
+def cells_of(x_m: Array, y_m: Array, side_m: float) -> NDArray[np.int64]:
+    """Return the square cell that each place is in, as one number; a step of y is a step of one."""
+    return np.asarray(np.floor(x_m / side_m).astype(np.int64) * (1 << 32) + np.floor(y_m / side_m).astype(np.int64))
 
 
 def compatible(a: Spots, b: Spots, config: InventoryConfig) -> tuple[Array, NDArray[np.bool_]]:
     """Return the distances (N, M) between two sets, and which pairs may be one tree."""
     distance = np.hypot(a.xy_m[:, None, 0] - b.xy_m[None, :, 0], a.xy_m[:, None, 1] - b.xy_m[None, :, 1])
     doubt = np.hypot(a.sigma_xy_m[:, None], b.sigma_xy_m[None, :])
-    gate = np.minimum(np.maximum(config.merge_m, _GATE_SIGMAS * doubt), _GATE_MAX_M)
+    gate = np.minimum(np.maximum(config.merge_m, _GATE_SIGMAS * doubt), GATE_MAX_M)
     radius_doubt = np.hypot(a.sigma_radius_m[:, None], b.sigma_radius_m[None, :])
     radius_gate = np.maximum(config.merge_radius_m, _GATE_SIGMAS * radius_doubt)
     alike = np.abs(a.radius_m[:, None] - b.radius_m[None, :]) <= radius_gate
