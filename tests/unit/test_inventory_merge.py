@@ -309,6 +309,30 @@ def test_assignment_is_one_to_one_and_nearest_first() -> None:
     assert list(assign(new, Spots.of([]), InventoryConfig())) == [-1, -1]
 
 
+def test_a_thousand_trees_meet_a_thousand_in_memory_for_neighbours() -> None:
+    rng = np.random.default_rng(3)
+    known = Spots(
+        rng.uniform(-80.0, 80.0, (1500, 2)), np.full(1500, 0.1), rng.uniform(0.0, 0.4, 1500), np.full(1500, 0.01)
+    )
+    new = Spots(
+        known.xy_m + rng.normal(0.0, 0.3, (1500, 2)), known.radius_m, known.sigma_xy_m[::-1], known.sigma_radius_m
+    )
+    tracemalloc.start()
+    found = assign(new, known, InventoryConfig())
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak_bytes < 10e6  # each with each: 126 MB, and 22 GB for two lists as long as a list may be
+    distance = np.hypot(*(new.xy_m[:, None] - known.xy_m[None]).transpose(2, 0, 1))
+    gate = np.clip(3.0 * np.hypot(new.sigma_xy_m[:, None], known.sigma_xy_m[None]), 0.3, 0.75)
+    expected = np.full(1500, -1)
+    for k in np.argsort(distance, axis=None)[: int(np.count_nonzero(distance <= 0.75))]:
+        row, column = divmod(int(k), 1500)
+        if distance[row, column] <= gate[row, column] and expected[row] < 0 and column not in expected:
+            expected[row] = column
+    assert np.array_equal(found, expected)
+    assert np.count_nonzero(found >= 0) > 1000
+
+
 def test_the_mean_leans_to_the_surer_flight() -> None:
     sure = belief_of(tree(1, 0.0, 0.0).model_copy(update={"sigma_xy_m": 0.02}))
     unsure = belief_of(tree(1, 0.0, 0.0).model_copy(update={"sigma_xy_m": 0.2, "suitable": False, "observations": 1}))
