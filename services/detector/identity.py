@@ -11,7 +11,7 @@ import numpy as np
 
 from services.common.geometry import inverse
 from services.detector.config import DetectorServiceConfig
-from services.detector.map_store import Anchor, anchor_of
+from services.detector.map_store import Anchor, anchor_of, anchors_of
 from services.detector.model import Floats, Trunk
 
 
@@ -93,8 +93,9 @@ class Identities:
 
     def fasten(self, poses: Mapping[int, Floats]) -> None:
         """Anchor each tree to the submap that looks at it most squarely, where ``poses`` (4, 4) have it."""
-        for tree in self.trees:
-            tree.anchor = anchor_of(np.array(tree.trunk.base_m), poses)
+        anchors = anchors_of([np.array(tree.trunk.base_m) for tree in self.trees], poses)
+        for tree, anchor in zip(self.trees, anchors, strict=True):
+            tree.anchor = anchor
 
     def update(self, trunks: Sequence[Trunk], shown: Callable[[Floats], bool] = lambda _: True) -> list[TreeEvent]:
         """Match a whole new detection, nearest pairs first, each side once; return what happened to whom.
@@ -168,12 +169,11 @@ class Identities:
         by_x = sorted(range(len(trunks)), key=lambda j: trunks[j].base_m[0])
         xs = [trunks[j].base_m[0] for j in by_x]
         most_sigma_m = max((trunk.sigma_xy_m for trunk in trunks), default=0.0)
-        pairs = []
+        pairs: list[tuple[float, int, int]] = []
         for i, tree in enumerate(self.trees):
             x, reach = tree.trunk.base_m[0], self._reach_m(tree, most_sigma_m)
-            for j in by_x[bisect_left(xs, x - reach) : bisect_right(xs, x + reach)]:
-                if self._alike(tree, trunks[j]):
-                    pairs.append((self._distance(tree, trunks[j]), i, j))
+            near = by_x[bisect_left(xs, x - reach) : bisect_right(xs, x + reach)]
+            pairs += [(self._distance(tree, trunks[j]), i, j) for j in near if self._alike(tree, trunks[j])]
         return sorted(pairs)
 
     def _alike(self, tree: TrackedTree, trunk: Trunk) -> bool:

@@ -135,3 +135,17 @@ def test_a_thousand_trees_are_matched_with_their_neighbours_only() -> None:
     assert all(t.missed == 0 and t.observations == 4 for t in ids.trees)
     off = [np.hypot(*(np.array(t.trunk.base_m[:2]) - place)) for t, place in zip(ids.trees, xy, strict=True)]
     assert np.median(off) < 0.01
+
+
+def test_a_thousand_trees_are_fastened_to_five_hundred_submaps_in_a_moment() -> None:
+    ids, xy = large()
+    rng = np.random.default_rng(6)
+    places = rng.uniform(0.0, xy.max(), (500, 2))
+    poses = {k: level_camera((x, y, 1.5), float(rng.uniform(-3.0, 3.0))) for k, (x, y) in enumerate(places.tolist())}
+    assert least_s(lambda: ids.fasten(poses)) < 0.2  # 0.7 s with each pose on its own
+    for tree in ids.trees[::100]:
+        to = {k: np.array(tree.trunk.base_m[:2]) - T[:2, 3] for k, T in poses.items()}
+        near = [k for k in poses if 0.3 < np.hypot(*to[k]) < 6.0]
+        squarest = max(near, key=lambda k: float(poses[k][:2, 2] @ to[k]) / float(np.hypot(*to[k])))
+        assert tree.anchor is not None
+        assert tree.anchor.submap_id == squarest
