@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -10,7 +11,7 @@ import numpy as np
 
 from services.common.geometry import inverse
 from services.detector.config import DetectorServiceConfig
-from services.detector.map_store import Anchor, anchor_of
+from services.detector.map_store import Anchor, anchor_of, anchors_of
 from services.detector.model import Floats, Trunk
 
 
@@ -92,8 +93,9 @@ class Identities:
 
     def fasten(self, poses: Mapping[int, Floats]) -> None:
         """Anchor each tree to the submap that looks at it most squarely, where ``poses`` (4, 4) have it."""
-        for tree in self.trees:
-            tree.anchor = anchor_of(np.array(tree.trunk.base_m), poses)
+        anchors = anchors_of([np.array(tree.trunk.base_m) for tree in self.trees], poses)
+        for tree, anchor in zip(self.trees, anchors, strict=True):
+            tree.anchor = anchor
 
     def update(self, trunks: Sequence[Trunk], shown: Callable[[Floats], bool] = lambda _: True) -> list[TreeEvent]:
         """Match a whole new detection, nearest pairs first, each side once; return what happened to whom.
@@ -103,17 +105,11 @@ class Identities:
         Two trees that became one trunk are merged at once, under the id that fits better; a trunk that was not seen is kept
         for a few updates, because a look from elsewhere may miss it.
         """
-        pairs = sorted(
-            (self._distance(tree, trunk), i, j)
-            for i, tree in enumerate(self.trees)
-            for j, trunk in enumerate(trunks)
-            if self._alike(tree, trunk)
-        )
         owner: dict[int, TrackedTree] = {}
         """Tree of each trunk."""
         matched: set[int] = set()
         before = {tree.tree_id: tree.trunk.radius_m for tree in self.trees}
-        for _, i, j in pairs:
+        for _, i, j in self._pairs(trunks):
             if i in matched or j in owner:
                 continue
             matched.add(i)
@@ -165,10 +161,29 @@ class Identities:
                 events.append(TreeEvent("appeared", new.tree_id))
         return events
 
+    def _pairs(self, trunks: Sequence[Trunk]) -> list[tuple[float, int, int]]:
+        """Return which tree may be which trunk, the nearest first.
+
+        Only trunks whose x is near the tree's are asked: in a large map each with each takes seconds.
+        """
+        by_x = sorted(range(len(trunks)), key=lambda j: trunks[j].base_m[0])
+        xs = [trunks[j].base_m[0] for j in by_x]
+        most_sigma_m = max((trunk.sigma_xy_m for trunk in trunks), default=0.0)
+        pairs: list[tuple[float, int, int]] = []
+        for i, tree in enumerate(self.trees):
+            x, reach = tree.trunk.base_m[0], self._reach_m(tree, most_sigma_m)
+            near = by_x[bisect_left(xs, x - reach) : bisect_right(xs, x + reach)]
+            pairs += [(self._distance(tree, trunks[j]), i, j) for j in near if self._alike(tree, trunks[j])]
+        return sorted(pairs)
+
     def _alike(self, tree: TrackedTree, trunk: Trunk) -> bool:
         a, b = tree.trunk.radius_m, trunk.radius_m
-        reach = self._config.same_tree_m + a + 3.0 * np.hypot(tree.trunk.sigma_xy_m, trunk.sigma_xy_m)
-        return self._distance(tree, trunk) < reach and abs(a - b) < 0.05 + 0.5 * max(a, b)
+        near = self._distance(tree, trunk) < self._reach_m(tree, trunk.sigma_xy_m)
+        return near and abs(a - b) < 0.05 + 0.5 * max(a, b)
+
+    def _reach_m(self, tree: TrackedTree, sigma_m: float) -> float:
+        doubt = float(np.hypot(tree.trunk.sigma_xy_m, sigma_m))
+        return self._config.same_tree_m + tree.trunk.radius_m + 3.0 * doubt
 
     @staticmethod
     def _distance(tree: TrackedTree, trunk: Trunk) -> float:

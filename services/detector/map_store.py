@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +14,7 @@ from services.detector.model import Floats, Views
 
 _PATIENCE_S = (2.0, 30.0)
 """Least and longest time between two questions that do not help."""
+_NEAREST_M = 0.3
 _RANGE_M = 6.0
 """As far as the mapper believes the depth image."""
 _TRUNK_M = 0.6
@@ -180,7 +181,7 @@ class MapStore:
             T = held.T_map_submap
             level = np.array([position_m[0], position_m[1], T[2, 3]]) - T[:3, 3]
             right, ahead = float(T[:3, 0] @ level), float(T[:3, 2] @ level)
-            if 0.3 < ahead < _RANGE_M + _TRUNK_M and abs(right) < held.tan_half[0] * ahead + _TRUNK_M:
+            if _NEAREST_M < ahead < _RANGE_M + _TRUNK_M and abs(right) < held.tan_half[0] * ahead + _TRUNK_M:
                 return True
         return False
 
@@ -200,16 +201,26 @@ class Anchor:
 
 def anchor_of(position_m: Floats, poses: Mapping[int, Floats], reach_m: float = _RANGE_M) -> Anchor | None:
     """Return the submap of ``poses`` (by id) that looks at a place (3,) most squarely, None when none does."""
-    best, score = None, 0.0
-    for submap_id, T in poses.items():
-        to = position_m - T[:3, 3]
-        distance = float(np.hypot(to[0], to[1]))
-        if not 0.3 < distance < reach_m:
-            continue
-        forward = float(T[:2, 2] @ to[:2]) / distance
-        if forward > score:
-            best, score = Anchor(submap_id, T), forward
-    return best
+    return anchors_of([position_m], poses, reach_m)[0]
+
+
+def anchors_of(
+    positions_m: Sequence[Floats], poses: Mapping[int, Floats], reach_m: float = _RANGE_M
+) -> list[Anchor | None]:
+    """Return the same for several places: the poses are stacked once."""
+    if not poses:
+        return [None] * len(positions_m)
+    submap_ids, stacked = list(poses), np.array(list(poses.values()))
+    at, ahead = stacked[:, :2, 3], stacked[:, :2, 2]
+    found: list[Anchor | None] = []
+    for position_m in positions_m:
+        to = position_m[:2] - at
+        distance = np.hypot(to[:, 0], to[:, 1])
+        near = (distance > _NEAREST_M) & (distance < reach_m)
+        forward = np.where(near, (ahead * to).sum(axis=1) / np.maximum(distance, _NEAREST_M), 0.0)
+        best = int(np.argmax(forward))
+        found.append(Anchor(submap_ids[best], poses[submap_ids[best]]) if forward[best] > 0.0 else None)
+    return found
 
 
 def _placed(points_m: NDArray[np.float32], T: Floats) -> NDArray[np.float32]:

@@ -14,11 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from services.inventory.config import InventoryConfig
-from services.inventory.merge import Array, Spots, assign
+from services.inventory.merge import GATE_MAX_M, Array, Spots, assign, cells_of
 
 _MOST_TREES = 40
 _MIN_PAIR_M = 1.0
 _MAX_PAIR_M = 25.0
+_PAIR_SLACK = 0.02
+"""Of a pair's length: by so much more than the prior's shift its middle may move."""
 _CLEAR_SHARE = 0.75
 """Another placement that explains this share of the best one's trees makes it ambiguous."""
 _SAME_TURN_RAD = math.radians(2.0)
@@ -53,7 +55,8 @@ def align(flight: Spots, known: Spots, config: InventoryConfig, prior: Prior | N
     Without a prior twice as many trees must agree.
     """
     least = config.align_min_trees * (1 if prior is not None else 2)
-    flight, known = _surest(flight), known
+    flight = _surest(flight, _MOST_TREES)
+    known = _within_reach(flight, known, prior)
     if len(flight) < least or len(known) < least:
         return None
     turns, shifts = _hypotheses(flight, known, config, prior)
@@ -66,9 +69,18 @@ def align(flight: Spots, known: Spots, config: InventoryConfig, prior: Prior | N
     return _refined(flight, known, config, float(turns[best]), shifts[best], least)
 
 
-def _surest(trees: Spots) -> Spots:
-    order = np.argsort(trees.sigma_xy_m, kind="stable")[:_MOST_TREES]
-    return Spots(trees.xy_m[order], trees.radius_m[order], trees.sigma_xy_m[order], trees.sigma_radius_m[order])
+def _surest(trees: Spots, most: int) -> Spots:
+    return trees.at(np.argsort(trees.sigma_xy_m, kind="stable")[:most])
+
+
+def _within_reach(flight: Spots, known: Spots, prior: Prior | None) -> Spots:
+    """Return the known trees that the prior lets the flight's be: those beyond neither vote nor say how far it overlaps."""
+    if prior is None or not len(flight):
+        return known
+    centre = flight.xy_m.mean(axis=0)
+    extent = float(np.hypot(*(flight.xy_m - centre).T).max())
+    reach = extent * (1.0 + prior.turn_rad) + prior.shift_m + _PAIR_SLACK * _MAX_PAIR_M + GATE_MAX_M
+    return known.at(np.nonzero(np.hypot(*(known.xy_m - centre).T) <= reach)[0])
 
 
 def _pairs(trees: Spots) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
@@ -80,8 +92,7 @@ def _pairs(trees: Spots) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
 
 def _hypotheses(flight: Spots, known: Spots, config: InventoryConfig, prior: Prior | None) -> tuple[Array, Array]:
     """Return turns (H,) and shifts (H, 2) of matching pairs, the longest baselines first."""
-    near = _reachable(flight, known, prior)
-    known = Spots(known.xy_m[near], known.radius_m[near], known.sigma_xy_m[near], known.sigma_radius_m[near])
+    known = _surest(known, 4 * _MOST_TREES)
     i, j, d = _pairs(flight)
     forward = i < j  # the other order gives the same hypotheses
     i, j, d = i[forward], j[forward], d[forward]
@@ -100,7 +111,7 @@ def _hypotheses(flight: Spots, known: Spots, config: InventoryConfig, prior: Pri
             centre = (flight.xy_m[i[a]] + flight.xy_m[j[a]]) / 2.0
             moved = _turned(centre[None], turn) + shift - centre
             fits = (np.abs(turn) <= prior.turn_rad) & (
-                np.hypot(moved[:, 0], moved[:, 1]) <= prior.shift_m + 0.02 * d[a]
+                np.hypot(moved[:, 0], moved[:, 1]) <= prior.shift_m + _PAIR_SLACK * d[a]
             )
             turn, shift = turn[fits], shift[fits]
         turns.append(turn)
@@ -110,16 +121,6 @@ def _hypotheses(flight: Spots, known: Spots, config: InventoryConfig, prior: Pri
     if not turns:
         return np.zeros(0), np.zeros((0, 2))
     return np.concatenate(turns)[:_HYPOTHESES], np.concatenate(shifts)[:_HYPOTHESES]
-
-
-def _reachable(flight: Spots, known: Spots, prior: Prior | None) -> NDArray[np.int64]:
-    if prior is None:
-        return np.argsort(known.sigma_xy_m, kind="stable")[: 4 * _MOST_TREES]
-    centre = flight.xy_m.mean(axis=0)
-    extent = float(np.hypot(*(flight.xy_m - centre).T).max())
-    far = np.hypot(*(known.xy_m - centre).T)
-    inside = np.nonzero(far <= extent * (1.0 + prior.turn_rad) + prior.shift_m + 1.0)[0]
-    return inside[np.argsort(known.sigma_xy_m[inside], kind="stable")[: 4 * _MOST_TREES]]
 
 
 def _from_pairs(
@@ -151,24 +152,29 @@ def _moved(flight: Spots, turn: float, shift: Array) -> Spots:
 def _votes(flight: Spots, known: Spots, config: InventoryConfig, turns: Array, shifts: Array) -> NDArray[np.int64]:
     """Return for each placement how many of the flight's trees stand on a known one of like radius.
 
-    The known trees are painted as discs into a grid that holds their radii, so that a vote is one look-up.
+    The known trees are painted as discs into cells that hold their radii, so that a vote is one look-up.
     """
-    low = known.xy_m.min(axis=0) - config.merge_m
-    size = np.ceil((known.xy_m.max(axis=0) + config.merge_m - low) / _CELL_M).astype(np.int64) + 1
-    grid = np.full((int(size[0]) + 2, int(size[1]) + 2), np.nan)  # its border stands for everything outside
-    reach = int(config.merge_m / _CELL_M)
-    steps = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2), axis=-1).reshape(-1, 2)
-    steps = steps[np.hypot(*steps.T) * _CELL_M <= config.merge_m]
-    centre = ((known.xy_m - low) / _CELL_M).astype(np.int64) + 1
-    for step in steps[np.argsort(-np.hypot(*steps.T), kind="stable")]:  # the nearer disc is painted over the farther
-        cell = np.clip(centre + step, 1, size)
-        grid[cell[:, 0], cell[:, 1]] = known.radius_m
+    cells, radius_m = _painted(known, min(config.merge_m, GATE_MAX_M))
     c, s = np.cos(turns)[:, None], np.sin(turns)[:, None]
     x, y = flight.xy_m[:, 0][None], flight.xy_m[:, 1][None]
-    u = ((c * x - s * y + shifts[:, :1] - low[0]) / _CELL_M).astype(np.int64) + 1
-    v = ((s * x + c * y + shifts[:, 1:] - low[1]) / _CELL_M).astype(np.int64) + 1
-    there = grid[np.clip(u, 0, size[0] + 1), np.clip(v, 0, size[1] + 1)]
-    return np.asarray((np.abs(there - flight.radius_m[None]) <= config.merge_radius_m).sum(axis=1), dtype=np.int64)
+    wanted = cells_of(c * x - s * y + shifts[:, :1], s * x + c * y + shifts[:, 1:], _CELL_M)
+    place = np.minimum(np.searchsorted(cells, wanted), len(cells) - 1)
+    alike = np.abs(radius_m[place] - flight.radius_m[None]) <= config.merge_radius_m
+    return np.asarray((alike & (cells[place] == wanted)).sum(axis=1), dtype=np.int64)
+
+
+def _painted(known: Spots, disc_m: float) -> tuple[NDArray[np.int64], Array]:
+    """Return the cells within ``disc_m`` of a known tree, in order, and the radius of the tree nearest to each.
+
+    Only these are held: one tree far off would make a grid around all of them huge.
+    """
+    reach = int(disc_m / _CELL_M)
+    steps = _CELL_M * np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 2), axis=-1).reshape(-1, 2)
+    off = np.hypot(*steps.T)
+    nearest_first = np.argsort(off, kind="stable")[: int(np.count_nonzero(off <= disc_m))]
+    at = (known.xy_m[None] + steps[nearest_first, None]).reshape(-1, 2)
+    cells, first = np.unique(cells_of(at[:, 0], at[:, 1], _CELL_M), return_index=True)
+    return cells, known.radius_m[first % len(known)]
 
 
 def _rival(flight: Spots, turns: Array, shifts: Array, votes: NDArray[np.int64], best: int) -> int:

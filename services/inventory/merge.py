@@ -15,8 +15,9 @@ from services.inventory.values import Belief
 Array = NDArray[np.float64]
 
 _GATE_SIGMAS = 3.0
-_GATE_MAX_M = 0.75
+GATE_MAX_M = 0.75
 """However doubtful two positions are: trees stand farther apart."""
+_COLUMN = 1 << 32
 _SIGMA_FLOOR_M = 0.02
 _RADIUS_FLOOR_M = 0.004
 """No flight knows a tree better than this: errors of its map are common to all its lists."""
@@ -37,19 +38,42 @@ class Spots:
         table = np.array(rows, dtype=np.float64).reshape(-1, 5)
         return Spots(table[:, :2], table[:, 2], table[:, 3], table[:, 4])
 
+    def at(self, rows: NDArray[np.int64]) -> Spots:
+        """Return some of the trees."""
+        return Spots(self.xy_m[rows], self.radius_m[rows], self.sigma_xy_m[rows], self.sigma_radius_m[rows])
+
     def __len__(self) -> int:
         return len(self.radius_m)
 
 
-def compatible(a: Spots, b: Spots, config: InventoryConfig) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the distances (N, M) between two sets, and which pairs may be one tree."""
-    distance = np.hypot(a.xy_m[:, None, 0] - b.xy_m[None, :, 0], a.xy_m[:, None, 1] - b.xy_m[None, :, 1])
-    doubt = np.hypot(a.sigma_xy_m[:, None], b.sigma_xy_m[None, :])
-    gate = np.minimum(np.maximum(config.merge_m, _GATE_SIGMAS * doubt), _GATE_MAX_M)
-    radius_doubt = np.hypot(a.sigma_radius_m[:, None], b.sigma_radius_m[None, :])
+def cells_of(x_m: Array, y_m: Array, side_m: float) -> NDArray[np.int64]:
+    """Return the square cell that each place is in, as one number: one more for a step of y, ``_COLUMN`` for one of x."""
+    return np.asarray(np.floor(x_m / side_m).astype(np.int64) * _COLUMN + np.floor(y_m / side_m).astype(np.int64))
+
+
+def _neighbours(a: Spots, b: Spots) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the pairs of two sets, as rows of ``a`` and of ``b``, that stand in the same or in touching cells."""
+    cells = cells_of(b.xy_m[:, 0], b.xy_m[:, 1], GATE_MAX_M)
+    order = np.argsort(cells, kind="stable")
+    cells = cells[order]
+    own = cells_of(a.xy_m[:, 0], a.xy_m[:, 1], GATE_MAX_M)
+    rows, columns = [], []
+    for at in (own - _COLUMN, own, own + _COLUMN):
+        begin, end = np.searchsorted(cells, at - 1, side="left"), np.searchsorted(cells, at + 1, side="right")
+        row = np.repeat(np.arange(len(a)), end - begin)
+        first = np.cumsum(end - begin) - (end - begin)
+        rows.append(row)
+        columns.append(order[np.arange(len(row)) - first[row] + begin[row]])
+    return np.concatenate(rows), np.concatenate(columns)
+
+
+def _compatible(a: Spots, b: Spots, config: InventoryConfig) -> tuple[Array, NDArray[np.bool_]]:
+    """Return the distances between trees of two sets, row by row, and which may be one tree."""
+    distance = np.hypot(*(a.xy_m - b.xy_m).T)
+    gate = np.minimum(np.maximum(config.merge_m, _GATE_SIGMAS * np.hypot(a.sigma_xy_m, b.sigma_xy_m)), GATE_MAX_M)
+    radius_doubt = np.hypot(a.sigma_radius_m, b.sigma_radius_m)
     radius_gate = np.maximum(config.merge_radius_m, _GATE_SIGMAS * radius_doubt)
-    alike = np.abs(a.radius_m[:, None] - b.radius_m[None, :]) <= radius_gate
-    return distance, (distance <= gate) & alike
+    return distance, (distance <= gate) & (np.abs(a.radius_m - b.radius_m) <= radius_gate)
 
 
 def assign(new: Spots, known: Spots, config: InventoryConfig) -> NDArray[np.int64]:
@@ -57,11 +81,12 @@ def assign(new: Spots, known: Spots, config: InventoryConfig) -> NDArray[np.int6
     found = np.full(len(new), -1, dtype=np.int64)
     if not len(new) or not len(known):
         return found
-    distance, may = compatible(new, known, config)
-    rows, columns = np.nonzero(may)
+    rows, columns = _neighbours(new, known)  # not each with each: two long lists would take gigabytes
+    distance, may = _compatible(new.at(rows), known.at(columns), config)
+    rows, columns, distance = rows[may], columns[may], distance[may]
     taken: set[int] = set()
     # distance first, then the indices: equal distances give equal results on every machine
-    for k in np.lexsort((columns, rows, distance[rows, columns])):
+    for k in np.lexsort((columns, rows, distance)):
         row, column = int(rows[k]), int(columns[k])
         if found[row] < 0 and column not in taken:
             found[row] = column

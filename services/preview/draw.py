@@ -47,18 +47,18 @@ def draw(image: Image, overlay: Overlay, factor: float) -> None:
         _text(image, overlay.warning, (10, 48), 0.65, _AMBER)
 
 
-def _points(quad: tuple[Pixel, ...], factor: float, image: Image) -> NDArray[np.int32]:
+def _points(corners: tuple[Pixel, ...], factor: float, image: Image) -> NDArray[np.int32]:
     limit = 4.0 * max(image.shape[:2])  # OpenCV wraps coordinates far outside
-    return np.clip(np.array(quad) * factor, -limit, limit).round().astype(np.int32).reshape(-1, 1, 2)
+    return np.clip(np.array(corners) * factor, -limit, limit).round().astype(np.int32).reshape(-1, 1, 2)
 
 
 def _outline(image: Image, outline: Outline, factor: float, colour: Colour, thickness: int) -> None:
     import cv2
 
-    cv2.polylines(image, [_points(outline.quad, factor, image)], True, colour, thickness, cv2.LINE_AA)  # noqa: FBT003
+    cv2.polylines(image, [_points(outline.corners, factor, image)], True, colour, thickness, cv2.LINE_AA)  # noqa: FBT003
     if thickness > 1:
-        (u0, _), (u1, _), *_ = outline.quad
-        at_top = min(v for _, v in outline.quad) * factor
+        (u0, _), (u1, _), *_ = outline.corners
+        at_top = min(v for _, v in outline.corners) * factor
         place = (round(max(u0, u1) * factor) + 4, round(np.clip(at_top + 14, 64, image.shape[0] - 40)))
         # the map's words above the depth image's
         _text(image, outline.label, (place[0], place[1] + (18 if colour == _GREEN else 0)), 0.45, colour)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +19,17 @@ from schemas.navigation import Guidance, MissionState
 from schemas.slam import Pose
 from schemas.trees import Target, Tree
 from services.common.geometry import apply, from_transform, inverse
+from services.detector.refine.view import distort
 
+Array = NDArray[np.float64]
 Pixel = tuple[float, float]
-Quad = tuple[Pixel, Pixel, Pixel, Pixel]
 
 _NEAR_M = 0.2
 _TRUNK_LOW_M, _TRUNK_HIGH_M = 0.0, 2.5
 """Part of a trunk that is outlined, above its ground."""
 _OTHER_WITHIN_M = 8.0
+_PLACES = 17
+"""Along a trunk's edge, where the lens bends it."""
 _WORDS = {
     "take_off": "take off", "landing": "land", "turn_left": "turn left", "turn_right": "turn right", "toward": "forward",
     "backward": "back", "stop": "stop", "docked": "docked",
@@ -36,8 +40,8 @@ _WORDS = {
 class Outline:
     """A trunk's outline in the picture."""
 
-    quad: Quad
-    """Corners at low left, low right, high right, high left."""
+    corners: tuple[Pixel, ...]
+    """From low left to low right, up the right edge and down the left one, as many on each."""
     label: str
 
 
@@ -101,13 +105,13 @@ _ARROWS: dict[str, tuple[float, float]] = {
 }  # fmt: skip
 
 
-def trunk_outline(tree: Tree, T_camera_map: NDArray[np.float64], i: Intrinsics) -> Outline | None:
-    """Return the quadrangle of a trunk, None when it is behind the camera, out of view or far."""
+def trunk_outline(tree: Tree, T_camera_map: Array, i: Intrinsics) -> Outline | None:
+    """Return the outline of a trunk, None when it is behind the camera, out of view or far."""
     return trunk_outlines((tree,), T_camera_map, i).get(tree.id)
 
 
-def trunk_outlines(trees: Sequence[Tree], T_camera_map: NDArray[np.float64], i: Intrinsics) -> dict[int, Outline]:
-    """Return the quadrangles of the trunks that are in view and near, by their number: all worked out at once."""
+def trunk_outlines(trees: Sequence[Tree], T_camera_map: Array, i: Intrinsics) -> dict[int, Outline]:
+    """Return the outlines of the trunks that are in view and near, by their number: all worked out at once."""
     if not trees:
         return {}
     axes = np.array([t.axis for t in trees])
@@ -116,19 +120,42 @@ def trunk_outlines(trees: Sequence[Tree], T_camera_map: NDArray[np.float64], i: 
     sideways = np.cross(high - low, 0.5 * (low + high))
     radii = np.array([t.radius_m for t in trees])
     sideways *= (radii / np.maximum(np.linalg.norm(sideways, axis=1), 1e-9))[:, None]
-    corners = np.stack([low - sideways, low + sideways, high + sideways, high - sideways], axis=1)
+    share = np.linspace(0.0, 1.0, _PLACES if i.distorted else 2)[:, None]
+    middle = low[:, None] + share * (high - low)[:, None]
+    left, right = middle - sideways[:, None], middle + sideways[:, None]
+    corners = np.concatenate([left[:, :1], right, left[:, :0:-1]], axis=1)
     near = (np.minimum(low[:, 2], high[:, 2]) >= _NEAR_M) & (np.maximum(low[:, 2], high[:, 2]) <= _OTHER_WITHIN_M)
     depth = np.where(near[:, None], corners[:, :, 2], 1.0)
-    u, v = i.fx * corners[:, :, 0] / depth + i.cx, i.fy * corners[:, :, 1] / depth + i.cy
+    x, y = _bent(corners[:, :, 0] / depth, corners[:, :, 1] / depth, i)
+    u, v = i.fx * x + i.cx, i.fy * y + i.cy
     seen = near & (u.max(axis=1) >= 0) & (u.min(axis=1) <= i.width) & (v.max(axis=1) >= 0) & (v.min(axis=1) <= i.height)
     return {trees[k].id: _named(trees[k], u[k], v[k]) for k in np.flatnonzero(seen).tolist()}
 
 
-def _named(tree: Tree, u: NDArray[np.float64], v: NDArray[np.float64]) -> Outline:
-    a, b, c, d = zip(u.tolist(), v.tolist(), strict=True)
-    if a[0] > b[0]:
-        a, b, c, d = b, a, d, c
-    return Outline((a, b, c, d), f"{tree.id}  {200.0 * tree.radius_m:.0f} cm")
+def _bent(x: Array, y: Array, i: Intrinsics) -> tuple[Array, Array]:
+    """Return where the lens shows rays; those beyond the picture are moved as its rim is, for its formula folds them back."""
+    if not i.distorted:
+        return x, y
+    beyond = np.maximum(np.hypot(x, y) / _rim(i), 1.0)
+    x, y = distort(x / beyond, y / beyond, i)
+    return x * beyond, y * beyond
+
+
+@lru_cache(maxsize=4)
+def _rim(i: Intrinsics) -> float:
+    """Return how far from the axis (tangent) the lens's formula holds: to the picture's corner, or to where it turns back."""
+    corner = math.hypot(max(i.cx, i.width - i.cx) / i.fx, max(i.cy, i.height - i.cy) / i.fy)
+    ray = np.linspace(0.0, 2.0 * corner, 401)
+    shown = distort(ray, np.zeros_like(ray), i)[0]
+    ends = np.flatnonzero((np.diff(shown) <= 0.0) | (shown[:-1] >= corner))
+    return float(ray[max(int(ends[0]), 1)] if len(ends) else ray[-1])
+
+
+def _named(tree: Tree, u: Array, v: Array) -> Outline:
+    corners = list(zip(u.tolist(), v.tolist(), strict=True))
+    if corners[0][0] > corners[1][0]:  # upside down: the right edge is the left one
+        corners = [corners[1], corners[0], *corners[:1:-1]]
+    return Outline(tuple(corners), f"{tree.id}  {200.0 * tree.radius_m:.0f} cm")
 
 
 def _seen(target: Target | None, mapped: Outline | None, i: Intrinsics) -> Outline | None:
@@ -138,11 +165,13 @@ def _seen(target: Target | None, mapped: Outline | None, i: Intrinsics) -> Outli
     if target.range_m is None or target.radius_m is None or target.range_m < target.radius_m + 0.05:
         return None
     half = i.fx * math.tan(math.asin(target.radius_m / target.range_m))
-    low, high = (mapped.quad[0][1], mapped.quad[2][1]) if mapped else (0.98 * i.height, 0.02 * i.height)
+    low, high = 0.98 * i.height, 0.02 * i.height
+    if mapped is not None:
+        low, high = mapped.corners[0][1], mapped.corners[len(mapped.corners) // 2][1]
     x = target.image_x_px
-    quad = ((x - half, low), (x + half, low), (x + half, high), (x - half, high))
+    corners = ((x - half, low), (x + half, low), (x + half, high), (x - half, high))
     guessed = "" if target.measured else " (predicted)"
-    return Outline(quad, f"{target.range_m:.2f} m{guessed}")
+    return Outline(corners, f"{target.range_m:.2f} m{guessed}")
 
 
 def _headline(guidance: Guidance | None) -> str:

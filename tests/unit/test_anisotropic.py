@@ -80,10 +80,10 @@ def test_the_overlay_outlines_what_the_camera_sees() -> None:
     outline = trunk_outline(tree, inverse(T), R200)
     assert outline is not None
     columns = np.flatnonzero((render([Cone(2.0, 0.3, 0.1, taper=0.0, bottom=-9.0)], T, R200) < 2.2)[240])
-    assert outline.quad[0][0] == pytest.approx(columns[0], abs=3.0)
-    assert outline.quad[1][0] == pytest.approx(columns[-1], abs=3.0)
+    assert outline.corners[0][0] == pytest.approx(columns[0], abs=3.0)
+    assert outline.corners[1][0] == pytest.approx(columns[-1], abs=3.0)
     low = project(np.array([[-0.3, 1.3, 2.0]]), R200)[0, 1]
-    assert outline.quad[0][1] == pytest.approx(low, abs=0.25 * R200.fy)
+    assert outline.corners[0][1] == pytest.approx(low, abs=0.25 * R200.fy)
 
 
 def test_slams_doubt_of_far_points_is_between_both_focal_lengths() -> None:

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -103,3 +106,46 @@ def test_what_happens_to_trees_is_told() -> None:
     assert ids.update([trunk_at(1.0, 0, 0.12)]) == [], "missed once is not gone"
     (gone,) = ids.update([trunk_at(1.0, 0, 0.12)])
     assert str(gone) == "tree 3 is gone"
+
+
+def large(count: int = 1000) -> tuple[Identities, np.ndarray]:
+    """Return the trees of a large map, four square metres for each, and their places (N, 2)."""
+    ids = Identities(DetectorServiceConfig())
+    xy = np.random.default_rng(4).uniform(0.0, 2.0 * np.sqrt(count), (count, 2))
+    ids.update([trunk_at(float(x), float(y)) for x, y in xy])
+    return ids, xy
+
+
+def least_s(work: Callable[[], object]) -> float:
+    """Return the processor time of the quickest of three runs."""
+    spent = []
+    for _ in range(3):
+        begin_s = time.thread_time()
+        work()
+        spent.append(time.thread_time() - begin_s)
+    return min(spent)
+
+
+def test_a_thousand_trees_are_matched_with_their_neighbours_only() -> None:
+    ids, xy = large()
+    seen = xy + np.random.default_rng(5).normal(0.0, 0.005, xy.shape)
+    trunks = [trunk_at(float(x), float(y)) for x, y in seen]
+    assert least_s(lambda: ids.update(trunks)) < 0.3  # 1.7 s each with each
+    assert [t.tree_id for t in ids.trees] == list(range(1, 1001))
+    assert all(t.missed == 0 and t.observations == 4 for t in ids.trees)
+    off = [np.hypot(*(np.array(t.trunk.base_m[:2]) - place)) for t, place in zip(ids.trees, xy, strict=True)]
+    assert np.median(off) < 0.01
+
+
+def test_a_thousand_trees_are_fastened_to_five_hundred_submaps_in_a_moment() -> None:
+    ids, xy = large()
+    rng = np.random.default_rng(6)
+    places = rng.uniform(0.0, xy.max(), (500, 2))
+    poses = {k: level_camera((x, y, 1.5), float(rng.uniform(-3.0, 3.0))) for k, (x, y) in enumerate(places.tolist())}
+    assert least_s(lambda: ids.fasten(poses)) < 0.2  # 0.7 s with each pose on its own
+    for tree in ids.trees[::100]:
+        to = {k: np.array(tree.trunk.base_m[:2]) - T[:2, 3] for k, T in poses.items()}
+        near = [k for k in poses if 0.3 < np.hypot(*to[k]) < 6.0]
+        squarest = max(near, key=lambda k: float(poses[k][:2, 2] @ to[k]) / float(np.hypot(*to[k])))
+        assert tree.anchor is not None
+        assert tree.anchor.submap_id == squarest

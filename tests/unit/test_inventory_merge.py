@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -52,6 +53,10 @@ def seen_from(
             "sigma_xy_m": noise_m,
         }))  # fmt: skip
     return moved
+
+
+def spots_of(trees: list[Tree]) -> Spots:
+    return Spots.of([(t.x_m, t.y_m, t.radius_m, t.sigma_xy_m, t.sigma_radius_m) for t in trees])
 
 
 def take(book: Inventory, uav: str, trees: TreeList, now_ns: int) -> None:
@@ -258,8 +263,7 @@ def test_a_docked_tree_stays_visited() -> None:
 def test_alignment_is_right_or_absent(seed: int, yaw_rad: float, x_m: float, y_m: float) -> None:
     world = forest(seed)
     other = seen_from(world, yaw_rad, x_m, y_m, seed + 1)[:11]
-    spots = [Spots.of([(t.x_m, t.y_m, t.radius_m, t.sigma_xy_m, t.sigma_radius_m) for t in trees])
-             for trees in (other, world)]  # fmt: skip
+    spots = [spots_of(trees) for trees in (other, world)]
     found = align(spots[0], spots[1], InventoryConfig(), None)
     assert found is not None
     assert math.remainder(found.theta_rad - yaw_rad, 2.0 * math.pi) == pytest.approx(0.0, abs=0.03)
@@ -269,6 +273,33 @@ def test_alignment_is_right_or_absent(seed: int, yaw_rad: float, x_m: float, y_m
     assert far is None or not askew
 
 
+@pytest.mark.parametrize("prior", [None, Prior(0.2, 3.0)])
+def test_one_tree_far_off_takes_no_memory_and_moves_nothing(prior: Prior | None) -> None:
+    world = forest(4, 16)
+    flight = spots_of(seen_from(world, 0.08, 0.7, -0.4, 2))
+    alone = align(flight, spots_of(world), InventoryConfig(), prior)
+    assert alone is not None
+    assert alone.agreeing == 16
+    tracemalloc.start()
+    beside = align(flight, spots_of([*world, tree(99, -400.0, 400.0)]), InventoryConfig(), prior)
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert beside == alone
+    assert peak_bytes < 20e6  # the box around all trees, in cells of 0.1 m: 134 MB
+
+
+def test_with_a_prior_trees_out_of_reach_say_nothing_of_the_overlap() -> None:
+    world = forest(4, 16)
+    west = [t for t in world if t.x_m < -2.0]
+    flight = spots_of(seen_from(world, 0.02, 0.1, -0.1, 2))
+    prior = Prior(0.1, 0.5)
+    alone = align(flight, spots_of(west), InventoryConfig(), prior)
+    assert alone is not None
+    assert len(west) < 0.4 * len(world)
+    beyond = [tree(98, 400.0, -400.0), tree(99, 400.0, 400.0)]
+    assert align(flight, spots_of([*west, *beyond]), InventoryConfig(), prior) == alone
+
+
 def test_assignment_is_one_to_one_and_nearest_first() -> None:
     new = Spots.of([(0.0, 0.0, 0.1, 0.02, 0.01), (0.2, 0.0, 0.1, 0.02, 0.01)])
     known = Spots.of([(0.15, 0.0, 0.1, 0.02, 0.01)])
@@ -276,6 +307,30 @@ def test_assignment_is_one_to_one_and_nearest_first() -> None:
     thick = Spots.of([(0.15, 0.0, 0.3, 0.02, 0.01)])
     assert list(assign(new, thick, InventoryConfig())) == [-1, -1]
     assert list(assign(new, Spots.of([]), InventoryConfig())) == [-1, -1]
+
+
+def test_a_thousand_trees_meet_a_thousand_in_memory_for_neighbours() -> None:
+    rng = np.random.default_rng(3)
+    known = Spots(
+        rng.uniform(-80.0, 80.0, (1500, 2)), np.full(1500, 0.1), rng.uniform(0.0, 0.4, 1500), np.full(1500, 0.01)
+    )
+    new = Spots(
+        known.xy_m + rng.normal(0.0, 0.3, (1500, 2)), known.radius_m, known.sigma_xy_m[::-1], known.sigma_radius_m
+    )
+    tracemalloc.start()
+    found = assign(new, known, InventoryConfig())
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak_bytes < 10e6  # each with each: 126 MB, and 22 GB for two lists as long as a list may be
+    distance = np.hypot(*(new.xy_m[:, None] - known.xy_m[None]).transpose(2, 0, 1))
+    gate = np.clip(3.0 * np.hypot(new.sigma_xy_m[:, None], known.sigma_xy_m[None]), 0.3, 0.75)
+    expected = np.full(1500, -1)
+    for k in np.argsort(distance, axis=None)[: int(np.count_nonzero(distance <= 0.75))]:
+        row, column = divmod(int(k), 1500)
+        if distance[row, column] <= gate[row, column] and expected[row] < 0 and column not in expected:
+            expected[row] = column
+    assert np.array_equal(found, expected)
+    assert np.count_nonzero(found >= 0) > 1000
 
 
 def test_the_mean_leans_to_the_surer_flight() -> None:

@@ -22,6 +22,7 @@ from services.common.config import TreedockConfig
 from services.common.context import Context
 from services.common.geometry import apply, inverse, level_camera, to_transform
 from services.common.memory import Hub
+from services.detector.refine.view import project
 from services.preview.draw import Encoder, draw, scaled
 from services.preview.overlay import overlay_of, trunk_outline
 from services.preview.service import build
@@ -69,16 +70,46 @@ def guidance(command: str, magnitude: float = 0.4, unit: str = "m") -> Guidance:
 def test_the_outline_is_as_wide_as_the_trunk() -> None:
     outline = trunk_outline(tree(), inverse(T), I)
     assert outline is not None
-    xs = [u for u, _ in outline.quad]
+    xs = [u for u, _ in outline.corners]
     assert max(xs) - min(xs) == pytest.approx(500.0 * 0.24 / 3.0, abs=0.5)
     assert np.mean(xs) == pytest.approx(I.cx, abs=0.5)
-    assert outline.quad[0][1] == pytest.approx(239.5 + 500.0 * 1.5 / 3.0, abs=0.5), "its foot on the ground"
-    assert outline.quad[0][0] < outline.quad[1][0]
+    assert outline.corners[0][1] == pytest.approx(239.5 + 500.0 * 1.5 / 3.0, abs=0.5), "its foot on the ground"
+    assert outline.corners[0][0] < outline.corners[1][0]
 
 
 @pytest.mark.parametrize(("x_m", "y_m"), [(-3.0, 0.0), (9.0, 0.0), (3.0, 4.0), (0.1, 0.0)])
 def test_what_is_behind_far_or_beside_is_not_drawn(x_m: float, y_m: float) -> None:
     assert trunk_outline(tree(x_m=x_m, y_m=y_m), inverse(T), I) is None
+
+
+def middle_at(corners: tuple[tuple[float, float], ...], v: float) -> float:
+    """Return the column midway between an outline's edges in the row ``v``."""
+    high = len(corners) // 2
+    right, left = np.array(corners[1 : high + 1]), np.array(corners[:1] + corners[:high:-1])
+    return float(np.mean([np.interp(-v, -edge[:, 1], edge[:, 0]) for edge in (left, right)]))
+
+
+@pytest.mark.parametrize("lens", [{"k1": 0.26}, {"k1": 0.26, "k2": -0.95, "p1": -0.005, "p2": 0.0026, "k3": 1.16}])
+@pytest.mark.parametrize(("x_m", "y_m"), [(3.0, 1.6), (3.0, -1.6), (1.2, 0.6)])
+def test_the_outline_stands_where_the_lens_shows_the_trunk(lens: dict[str, float], x_m: float, y_m: float) -> None:
+    bent = I.model_copy(update=lens)
+    outline = trunk_outline(
+        tree(x_m=x_m, y_m=y_m, radius_m=0.04), inverse(T), bent
+    )  # thin: edges lie evenly about its axis
+    assert outline is not None
+    for height_m in (1.2, 1.5, 1.8):  # of the camera at 1.5 m the refiner tells the column
+        at = project(apply(inverse(T), np.array([[x_m, y_m, height_m]])), bent)[0]
+        assert middle_at(outline.corners, float(at[1])) == pytest.approx(at[0], abs=1.0)
+
+
+def test_what_lies_beyond_the_picture_is_not_folded_back_into_it() -> None:
+    barrel = I.model_copy(update={"k1": -0.3})
+    outline = trunk_outline(tree(x_m=0.6), inverse(T), barrel)  # its foot is 68 degrees below the axis
+    assert outline is not None
+    rows = [v for _, v in outline.corners]
+    assert rows[0] > I.height
+    assert rows[len(rows) // 2] < 0.0
+    assert rows[1 : len(rows) // 2 + 1] == sorted(rows[1 : len(rows) // 2 + 1], reverse=True)
 
 
 @given(st.floats(-8, 8), st.floats(-8, 8), st.floats(-3.1, 3.1))
@@ -90,7 +121,7 @@ def test_every_outline_lies_around_its_trunk(x_m: float, y_m: float, yaw_rad: fl
         return
     point = apply(inverse(seen_from), np.array([[x_m, y_m, 1.0]]))[0]
     u = I.fx * point[0] / point[2] + I.cx
-    xs = [p[0] for p in outline.quad]
+    xs = [p[0] for p in outline.corners]
     assert min(xs) - 1e-6 <= u <= max(xs) + 1e-6
 
 
@@ -99,7 +130,7 @@ def test_colours_mean_what_the_reference_says() -> None:
     overlay = overlay_of(I, pose(), (tree(), tree(8, y_m=0.8)), target, mission(), guidance("turn_left", 0.5, "rad"))
     assert overlay.mapped is not None
     assert overlay.seen is not None
-    assert np.mean([u for u, _ in overlay.seen.quad]) == pytest.approx(400.0)
+    assert np.mean([u for u, _ in overlay.seen.corners]) == pytest.approx(400.0)
     assert len(overlay.others) == 1
     assert overlay.arrow == (-1.0, 0.0)
     assert overlay.headline == "turn left 29 deg"
@@ -195,12 +226,14 @@ def test_pictures_only_while_somebody_looks_one_per_frame_and_bad_ones_are_count
     assert len(seen) == 2
 
 
-def test_a_forest_of_five_hundred_trees_costs_no_more_than_a_frame_may() -> None:
+@pytest.mark.parametrize("k1", [0.0, 0.26])
+def test_a_forest_of_five_hundred_trees_costs_no_more_than_a_frame_may(k1: float) -> None:
+    lens = I.model_copy(update={"k1": k1})
     forest = tuple(tree(k, 2.0 + 0.01 * k, -3.0 + 0.012 * k) for k in range(500))
     spent_s = []
     for _ in range(5):
         begin_s = time.thread_time()
-        shown = overlay_of(I, pose(), forest, None, None, None)
+        shown = overlay_of(lens, pose(), forest, None, None, None)
         spent_s.append(time.thread_time() - begin_s)
     assert len(shown.others) > 100
     assert min(spent_s) < 0.02  # 2.3 ms measured; one tree after the other took 39

@@ -1,11 +1,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from services.common.geometry import R_BODY_CAMERA, exp_rotation, pose, rotation_z
+from services.detector.refine.associate import Match, associate
 from services.detector.refine.config import RefinerConfig
 from services.detector.refine.model import Measurement
 from services.detector.refine.refine import refine
@@ -59,6 +61,29 @@ def test_three_close_trunks_are_told_apart_under_a_common_shift(gap: float) -> N
             measured = refine(depth, CAMERA, camera_at(), POSE_COVARIANCE * 16, expected[k], others, CONFIG)
             assert measured is not None
             assert _centre_error(measured, cone) < 0.02
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.7, np.pi / 2, np.pi, -2.0])
+def test_a_doubtful_heading_shifts_trees_sideways_wherever_the_camera_looks(
+    yaw: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stale = np.diag([0.02, 0.02, 0.02, 0.005, 0.005, 0.12]) ** 2
+    T, turn = camera_at(yaw=yaw), rotation_z(yaw)[:2, :2]
+    at, off = turn @ [3.0, 0.0], turn @ [0.0, -0.4]
+    cone = Cone(float(at[0]), float(at[1]), 0.1)
+    expected = cone.expected(shift=(float(off[0]), float(off[1])))
+    matches = []
+
+    def told(*given: Any) -> Match | None:
+        matches.append(associate(*given))
+        return matches[-1]
+
+    monkeypatch.setattr("services.detector.refine.refine.associate", told)
+    measured = refine(sensed(render([cone], T), 14), CAMERA, T, stale, expected, [], CONFIG)
+    assert measured is not None
+    assert _centre_error(measured, cone) < 0.02
+    assert matches[0] is not None
+    assert matches[0].score == pytest.approx(6.24, abs=0.1)  # of a reward of 8, as far as 0.4 m in 0.36 m is doubtful
 
 
 def test_the_biggest_object_is_not_the_target() -> None:

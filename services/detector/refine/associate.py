@@ -34,6 +34,8 @@ def associate(
 ) -> Match | None:
     """Return the object that is ``trees[0]``, or None when none is.
 
+    All places are in the sight's frame (away, left).
+
     Args:
         fits: Objects, with their circles.
         trees: The target first, then the other trees that may be in the window; each with its place (2,).

@@ -49,7 +49,8 @@ def refine(
         return None
     found = scan(depth_m, intrinsics, view, expected, reach, trees[0][1], bounds, config)
     fits = candidates(found, trees, gate, config)
-    match = associate(fits, trees, shift, gate)
+    turn = view.basis[:2, :2]  # fits and places are in the sight's frame, the pose's shift is in map
+    match = associate(fits, trees, turn @ shift @ turn.T, gate)
     if match is None:
         return None
     join_alike(found, match.fit, fits)
