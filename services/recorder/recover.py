@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from services.common.errors import InputError
+from services.common.files import make_alike
 
 if TYPE_CHECKING:
     from mcap.records import Channel, McapRecord
@@ -155,9 +156,7 @@ def _beside(fresh: Path, original: BinaryIO) -> Iterator[BinaryIO]:
     like = os.fstat(original.fileno())
     try:
         with fresh.open("wb") as out:
-            os.fchmod(out.fileno(), like.st_mode & 0o777)
-            with contextlib.suppress(PermissionError):  # only root may give files away, and only root needs to
-                os.fchown(out.fileno(), like.st_uid, like.st_gid)
+            make_alike(out.fileno(), like)
             yield out
     finally:
         fresh.unlink(missing_ok=True)

@@ -37,7 +37,7 @@ def rows() -> list[Row]:
     ] + [
         Row("corrupt map", "chain", "slam and mapper are killed and their saved maps overwritten with noise, or cut short",
             "both are READY within 3.5 s, name the damaged file and say what became of the map, and poses and trees come again", _corrupt_map),
-        Row("clock step", "chain", "slam, and then the router, are killed and started again on a machine whose clock was set by an hour",
+        Row("clock step", "chain", "slam, and then the router, are killed and started again on a machine whose clock was set by an hour (slam: ahead, then back)",
             "stamps go on as before within 20 ms; poses come again", _clock_step),
     ]  # fmt: skip
 
@@ -132,18 +132,20 @@ def unsaid(log: str, health: Health | None, damaged: Sequence[Path]) -> list[str
 def _clock_step(bench: Bench) -> Result:
     chain = bench.chain()
     rig, failed, told, worst = chain.rig, list[str](), list[str](), 0.0
-    for service in ("slam", "router"):
+    for service, hours in (("slam", 1), ("slam", -2), ("router", 1)):  # slam: an hour ahead, then an hour behind
         before = chain.known()
         path = rig.config_file(service)
         values = json.loads(path.read_text(encoding="utf-8"))
-        path.write_text(json.dumps({**values, "clock_ahead_s": values["clock_ahead_s"] + 3600.0}), encoding="utf-8")
+        ahead_s = values["clock_ahead_s"] + 3600.0 * hours
+        path.write_text(json.dumps({**values, "clock_ahead_s": ahead_s}), encoding="utf-8")
         back = chain.harm(service)
         rig.pump(4.0)
         off_s = {name: h.stamp_ns * 1e-9 - time.time() + _age_s(rig, name) for name, h in rig.health.items()}
         worst = max(worst, *(abs(v) for v in off_s.values()))
         failed += [f"{service}: {name} {off:+.2f} s off" for name, off in off_s.items() if abs(off) > _CLOCK_S]
         failed += faults_of_comeback(back, bench.limits) + chain.whole_again(before, 0)
-        told.append(f"{service} on a clock an hour ahead: stamps within {max(abs(v) for v in off_s.values()):.3f} s")
+        where = "ahead" if ahead_s > 0.0 else "behind"
+        told.append(f"{service} on a clock an hour {where}: stamps within {max(abs(v) for v in off_s.values()):.3f} s")
     bench.close()  # its clocks are no longer this machine's
     return Result(tuple(failed), {"clock_off_s": worst}, tuple(told))
 
