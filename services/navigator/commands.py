@@ -1,7 +1,8 @@
 """Who may command, and when: nonces that the aircraft issues, valid for a few seconds of its own time. Pure.
 
 A command names its sender's nonce and a sequence number above every earlier one of that nonce, so that a recorded
-command is worth nothing later and a repeated one is carried out at most once. Nobody's wall clock is asked.
+command is worth nothing later and a repeated one is carried out at most once. Nobody's wall clock is asked. Whoever says
+hold has the last word over all that was on its way by then: over a weak link an earlier resume may arrive after it.
 """
 
 from __future__ import annotations
@@ -10,9 +11,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from schemas.command import Command, NonceReply
+from schemas.orders import CommandName
 
 _MAX_NONCES = 64
 _PER_SENDER = 4
+_STOPS: frozenset[CommandName] = frozenset({"hold", "land", "abort"})
 
 
 @dataclass
@@ -29,7 +32,7 @@ class CommandDesk:
         self.valid_s = valid_s
         self._make_nonce = make_nonce
         self._issued: dict[bytes, _Issued] = {}
-        self._sequence = 0
+        self._sequence = self._stopped_at = 0
 
     def issue(self, sender: str, now_ns: int) -> NonceReply:
         """Return a new nonce for ``sender``. The oldest one gives way when there are too many."""
@@ -54,8 +57,12 @@ class CommandDesk:
             return f"the nonce was given to another sender, not to {command.sender}"
         if command.sequence < entry.next_sequence:
             return f"replayed: sequence {command.sequence}, expected {entry.next_sequence} or more"
+        if command.name not in _STOPS and command.sequence <= self._stopped_at:
+            return f"overtaken: {command.name} was on its way when a hold, land or abort was carried out; say it again"
         entry.next_sequence = command.sequence + 1
         self._sequence = max(self._sequence, command.sequence)
+        if command.name in _STOPS:
+            self._stopped_at = max(self._stopped_at, command.sequence)
         return ""
 
     def _forget(self, now_ns: int) -> None:

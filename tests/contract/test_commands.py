@@ -64,6 +64,16 @@ def test_sequences_rise_over_all_nonces() -> None:
     assert desk.issue("ground", 0).next_sequence == 42
 
 
+@pytest.mark.parametrize("stop", ["hold", "land", "abort"])
+def test_a_stop_has_the_last_word_over_what_was_on_its_way(stop: str) -> None:
+    desk = _desk()
+    slow, quick = desk.issue("ground", 0), desk.issue("ground", 0)
+    assert desk.refusal(_command(quick, name=stop), 1) == ""
+    assert "overtaken" in desk.refusal(_command(slow, name="resume"), 2)
+    assert desk.refusal(_command(slow, name="land"), 2) == "", "another stop is never too late"
+    assert desk.refusal(_command(desk.issue("ground", 3), name="resume"), 3) == "", "said after it, it counts"
+
+
 def test_many_nonces_neither_grow_memory_nor_evict_other_senders_fresh_ones() -> None:
     desk = _desk()
     mine = desk.issue("ground", 0)
