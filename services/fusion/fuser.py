@@ -85,8 +85,7 @@ class Fuser:
             late = late and stamp_ns - self.inertial.newest_ns < IMU_LATE_NS
             return self._late(located) if late else self._restart(located)
         if located is not None and self._contradicted(located):
-            carried = self._carry(stamp_ns)
-            return carried if self.guard.apart_m <= self.config.apart_m else None
+            return self._near(self._carry(stamp_ns))
         if located is not None:
             return self._follow(located)
         if not self.smoother.inertial:
@@ -120,8 +119,14 @@ class Fuser:
         """Tell a pose at once although the IMU's samples of that moment are still to come."""
         if located is None:
             return self.silence(self.inertial.newest_ns)
+        if self._contradicted(located):  # by the samples that are there, the last of them going on
+            return self._near(self.silence(self.inertial.newest_ns))
         self._pending = located
         return self._as_told(located)
+
+    def _near(self, carried: Fused | None) -> Fused | None:
+        """Return the pose that is carried on against slam's word, as long as the two are not too far apart."""
+        return carried if self.guard.apart_m <= self.config.apart_m else None
 
     def _catch_up(self) -> None:
         """Make a state of the frame that was too early for the IMU."""

@@ -85,6 +85,8 @@ class Carrier:
     def _merged(self, searched: U8, xy: F64, angle: F64, octave: I32, found: Corners, quota: I64) -> Corners:
         """Return the carried corners, and of those found the ones that are others, as many as each level has room for."""
         scales = self._detector.scales
+        fits = _first_of_each(octave, quota)
+        xy, angle, octave = xy[fits], angle[fits], octave[fits]
         whole = self._detector.whole_places(searched, xy, octave)
         new = apart(xy, found[0], _APART_PX * scales[found[3]] / scales[self._detector.finest_stretched])
         room = quota - np.bincount(octave, minlength=len(scales))
@@ -97,6 +99,14 @@ class Carrier:
             np.concatenate([angle, found[2][new]]),
             np.concatenate([octave, found[3][new]]),
         )
+
+
+def _first_of_each(octave: I32, quota: I64) -> Bool:
+    """Return which of corners (N,) are within their level's quota: an image holds no more than was made room for."""
+    fits = np.ones(len(octave), dtype=bool)
+    for level in np.unique(octave):
+        fits[np.flatnonzero(octave == level)[max(int(quota[level]), 0) :]] = False
+    return fits
 
 
 def carried(before: U8, now: U8, xy: F64) -> tuple[F64, Bool]:

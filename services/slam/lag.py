@@ -45,6 +45,10 @@ class Lag:
         """Remember the frame at hand: it became a keyframe, and nothing is known of its velocity."""
         self._kept = self._depth_m, self._after_s
 
+    def forget(self) -> None:
+        """Keep nothing: the next frame did not tell the velocity either, and no other keyframe may get this depth."""
+        self._kept = None
+
     def settle(self, kf: Keyframes, k: int, features: Features, velocity: Velocity, readout_s: float) -> None:
         """Give keyframe ``k``, the one that was kept, its depth anew now that its velocity is known."""
         kept, self._kept = self._kept, None

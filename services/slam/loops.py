@@ -67,13 +67,18 @@ class Loops:
         """Return the camera."""
         return self.mapping.camera
 
-    def consider(self, k: int) -> Correction | None:
-        """Look whether the new keyframe ``k`` closes a loop; if so correct the map."""
-        expect_nodes(len(self.atlas.slots))
+    def remember(self, k: int) -> Bag:
+        """Note what the new keyframe ``k`` looks like: it is found again by that, for a loop or after being lost."""
         with self.mapping.step():
             kf = self.atlas.keyframes
             bag = self.places.add(int(kf.serial[k]), kf.desc[k, : kf.n[k]])
             self.places.keep_only({int(s) for s in kf.serial[kf.n > 0]})
+            return bag
+
+    def consider(self, k: int, bag: Bag) -> Correction | None:
+        """Look whether the new keyframe ``k``, which looks like ``bag``, closes a loop; if so correct the map."""
+        expect_nodes(len(self.atlas.slots))
+        with self.mapping.step():
             candidates = self._candidates(k, bag)
         for candidate in candidates:
             turned = self.mapping.turned

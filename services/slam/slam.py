@@ -244,13 +244,15 @@ class Slam:
         settled = self.shutter.settle(self._motion.measured)
         if settled is not None:
             self._lag.settle(self.atlas.keyframes, *settled, self.shutter.readout_s)
+        else:
+            self._lag.forget()
         new: list[NewKeyframe] = []
         if self._rule.wants(stamp_ns, frame, self.crew.waiting) or self.graph_version == 0:
             new, graph = self._make_keyframe(frame, graph)
-        if self._rest.begins(stamp_ns, made=bool(new)):
-            self.crew.submit(self.mapping.adjust_all)
         self._set_anchor(frame)
         self._last = frame
+        if self._rest.begins(stamp_ns, made=bool(new)):
+            self.crew.submit(self.mapping.adjust_all)
         if self._trail is not None:
             self._trail.add(stamp_ns, self._reference, self._anchor)
         return self._result(stamp_ns, "tracking", frame, new, graph)
@@ -282,8 +284,9 @@ class Slam:
         if self.on_made is not None:
             self.on_made(k)
         self.mapping.settle(k)
+        bag = self.loops.remember(k)
         if self.config.loop_closing:
-            self.loops.consider(k)
+            self.loops.consider(k, bag)
         if self.on_settled is not None:
             self.on_settled()
         self.settled_ms.append((time.perf_counter() - begin) * 1e3)

@@ -166,7 +166,7 @@ class Store:
         self._size += len(data)
 
     def keep_only(self, serials: set[int]) -> None:
-        """Write the log anew with only the keyframes ``serials``.
+        """Write the log anew with only the keyframes ``serials``, and how often it was taken up.
 
         Raises:
             InputError, OSError: the disk refused; the log is as it was.
@@ -175,7 +175,7 @@ class Store:
             kept = (
                 record(kind, body)
                 for kind, body in records(data)
-                if kind == HEADER or (kind == KEYFRAME and _NUMBERS.unpack_from(body)[0] in serials)
+                if kind in (HEADER, TAKEN) or (kind == KEYFRAME and _NUMBERS.unpack_from(body)[0] in serials)
             )
             write_parts(self._log, kept, lasting=False)
         self._size = self._log.stat().st_size

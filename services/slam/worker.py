@@ -13,7 +13,7 @@ import queue
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from typing import Protocol
 
 from services.common.process import give_way
@@ -177,8 +177,9 @@ class Beside:
 
     def close(self) -> None:
         """Forget what waits and stop; a job that takes long is not waited for: its thread ends with the process."""
-        while not self._jobs.empty():
-            self._jobs.get()
+        with suppress(queue.Empty):  # the thread may take the last one meanwhile
+            while True:
+                self._jobs.get_nowait()
         self._jobs.put(None)
         self._thread.join(_CLOSE_S)
 

@@ -191,3 +191,38 @@ def test_a_dead_accelerometer_is_no_accelerometer(dead: F64) -> None:
     slam, results = run([np.eye(4)] * 2, accel=dead)
     assert results[-1].status == "tracking"
     assert slam.up_sigma_rad == gravity.SIGMA_UNKNOWN_RAD
+
+
+def test_without_loops_a_lost_camera_finds_its_place_again_too() -> None:
+    """As the second camera's slam runs."""
+    slam = Slam(INTRINSICS, SlamConfig(features=500, loop_closing=False))
+    views = [look(T) for T in turn_on_the_spot(20, 80.0)]
+    for k, (grey, depth_m) in enumerate(views):
+        assert slam.track(k * 66_000_000, grey, depth_m).status == "tracking"
+    before = slam.reset_counter
+    for k in range(20, 35):
+        slam.track(k * 66_000_000, np.zeros_like(views[0][0]), np.zeros_like(views[0][1]))
+    result = slam.track(35 * 66_000_000, *views[0])
+    assert result.status == "tracking"
+    assert result.reset_counter == before + 1
+
+
+def test_where_the_camera_rests_the_last_pose_follows_the_adjusted_map(monkeypatch: pytest.MonkeyPatch) -> None:
+    slam = Slam(INTRINSICS, SlamConfig(features=500))
+    shift = np.array([0.05, 0.0, 0.0])
+
+    def adjusted(**_: object) -> None:
+        atlas = slam.mapping.atlas
+        atlas.keyframes.t[atlas.slots] -= atlas.keyframes.R[atlas.slots] @ shift
+        atlas.points.pos[:] += shift
+        slam.mapping.revision += 1
+
+    monkeypatch.setattr(slam.mapping, "adjust_all", adjusted)
+    poses = turn_on_the_spot(8, 20.0)
+    told = [slam.track(k * 66_000_000, *look(T)) for k, T in enumerate(poses)]
+    monkeypatch.setattr(slam._rest, "begins", lambda *_, **__: True)
+    resting = slam.track(8 * 66_000_000, *look(poses[-1]))
+    assert resting.T_map_camera is not None
+    assert told[-1].T_map_camera is not None
+    (*_, (_, final)) = slam.final_trajectory()
+    assert final[:3, 3] - resting.T_map_camera[:3, 3] == pytest.approx(shift, abs=2e-3)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from services.common.geometry import inverse
+from services.common.geometry import inverse, level_camera
 from services.slam.camera import camera_model
 from services.slam.config import SlamConfig
 from services.slam.depth_noise import DepthNoise
@@ -13,7 +13,7 @@ from services.slam.features import Extractor
 from services.slam.lag import Lag, carried_back
 from services.slam.motion import Velocity
 from services.slam.slam import Slam
-from tests.unit.slam_room import INTRINSICS, look
+from tests.unit.slam_room import F64, INTRINSICS, look
 from tests.unit.test_slam_shutter import CAMERA, V_M_S, W_RAD_S, moved_after, points, project, swing
 
 FEW = SlamConfig(features=500)
@@ -68,3 +68,26 @@ def keyframes_depth_error_m(after_s: float, told_s: float) -> float:
 def test_a_lag_that_is_told_is_compensated_while_tracking(after_s: float) -> None:
     told, untold = keyframes_depth_error_m(after_s, after_s), keyframes_depth_error_m(after_s, 0.0)
     assert told < 0.3 * untold  # 2.0 and 2.5 mm to 11
+
+
+def test_a_keyframe_never_gets_the_depth_of_another_ones_image() -> None:
+    """The first keyframe's velocity never got known: the second frame came too late. Its image was kept for the next keyframe."""
+    slam, made = Slam(INTRINSICS, FEW), dict[int, float]()
+    stamps_s = [0.0, 0.5, *(0.57 + 0.07 * k for k in range(14))]
+    for at_s in stamps_s:
+        grey, depth_m = look(turned(at_s))
+        result = slam.track(round(at_s * 1e9), grey, depth_m, depth_after_s=0.005)
+        assert result.T_map_camera is not None
+        made |= {new.keyframe_id: at_s for new in result.new_keyframes}
+    kf, off_m = slam.atlas.keyframes, []
+    for k in slam.atlas.slots:
+        has = kf.depth[k, : kf.n[k]] > 0.0
+        column, row = np.round(kf.uv[k, : kf.n[k]]).astype(int).T
+        true_m = look(turned(made[int(kf.serial[k])]))[1][row, column]
+        off_m.append(float(np.median(np.abs(kf.depth[k, : kf.n[k]] - true_m)[has])))
+    assert len(off_m) > 2
+    assert max(off_m) < 0.01
+
+
+def turned(at_s: float) -> F64:
+    return level_camera([0.0, 0.0, 0.0], np.radians(30.0) * at_s)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from schemas.camera import Intrinsics
@@ -70,3 +71,12 @@ def test_an_image_smeared_by_motion_is_not_stretched() -> None:
     assert stretch(smeared) is None
     searched, _ = Detector(992, 8, 1.2, 19, 7).detect(smeared, DEPTH_M)
     assert searched is smeared
+
+
+@pytest.mark.parametrize("wanted", [500, 700])
+def test_corners_carried_out_of_the_fog_leave_no_more_than_a_keyframe_holds(wanted: int) -> None:
+    """In the fog all corners are coarse: carried into a clear image they were more than its coarse levels have room for."""
+    extractor = Extractor(CAMERA, SlamConfig(features=wanted))
+    for image in (foggy(1), foggy(2), clear()):
+        features = extractor.extract(image, DEPTH_M)
+        assert 0.4 * wanted < len(features) <= wanted

@@ -20,6 +20,7 @@ from services.slam.store import (
     BEAT,
     HEADER,
     KEYFRAME,
+    TAKEN,
     Arrays,
     Header,
     Store,
@@ -109,7 +110,11 @@ def test_the_log_is_bounded_and_tidied(tmp_path: Path) -> None:
     assert (tmp_path / "keyframes.log").stat().st_size <= 3000
     store.keep_only({2, 3})
     assert not store.full
+    for k in range(3):
+        store.mark(TAKEN, k)
+    store.keep_only({2, 3})
     log = store.read()
+    assert log.taken_ns == [0, 1, 2], "a map that ends slam again and again is to be noticed also with a full log"
     assert log.header == Header("m", "b", "c")
     assert [k.serial for k in log.keyframes] == [2, 3]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 import time
 from pathlib import Path
@@ -78,6 +79,20 @@ def test_a_failed_job_is_raised_by_the_next_frame() -> None:
         for _ in range(500):
             with crew.frame():
                 time.sleep(0.01)
+
+
+def test_closing_does_not_wait_for_a_job_that_the_thread_has_just_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    crew = Beside()
+
+    class Taken(queue.SimpleQueue[Any]):
+        def empty(self) -> bool:  # as it was a moment ago
+            return False
+
+    monkeypatch.setattr(crew, "_jobs", Taken())
+    closing = threading.Thread(target=crew.close, daemon=True)
+    closing.start()
+    closing.join(5.0)
+    assert not closing.is_alive()
 
 
 def test_a_frame_waits_for_mapping_that_has_fallen_behind() -> None:
