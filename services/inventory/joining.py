@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from services.inventory.align import Alignment, Prior, align
 from services.inventory.config import InventoryConfig
-from services.inventory.merge import assign
+from services.inventory.merge import Spots, partners
 from services.inventory.values import Flight, InventoryTree, Rigid2, Sighting
 
 if TYPE_CHECKING:
@@ -59,9 +59,8 @@ class Joiner:
         if flight.frame == "global":
             turn_rad, shift_m = max(flight.sigma_heading_rad, 0.01), max(flight.sigma_m, 0.1)
             prior = Prior(_PRIOR_SIGMAS * turn_rad * math.sqrt(2.0), _PRIOR_SIGMAS * shift_m * math.sqrt(2.0))
-        found = align(
-            self._book.placed(flight, [s.belief for s in sightings]), self._book.known(known), self._config, prior
-        )
+        placed = self._book.placed(flight, [s.belief for s in sightings])
+        found = align(placed, Spots.of_trees(known), self._config, prior)
         if found is not None:
             self._join(flight, site, found, now_ns)
 
@@ -82,7 +81,10 @@ class Joiner:
         book, turn = self._book, Rigid2(found.theta_rad, *found.shift_m)
         if site == flight.site:
             along: list[Flight] = []
-            trees = [book.trees[s.tree] for s in book.of_flight[flight.fid].values() if len(book.of_tree[s.tree]) == 1]
+            seen = {s.tree for s in book.of_flight[flight.fid].values()}
+            trees = [
+                book.trees[k] for k in sorted(seen) if all(s.flight == flight.fid for s in book.of_tree[k].values())
+            ]
         else:
             along = [f for f in book.flights.values() if f.site == flight.site and f is not flight]
             trees = [t for t in book.trees.values() if t.site == flight.site]
@@ -116,18 +118,16 @@ class Joiner:
 
     def _merge(self, flight: Flight, trees: list[InventoryTree]) -> set[int]:
         """Make trees those of the flight's site that they are; return these."""
-        apart = {t.fid for t in trees} | {s.tree for s in self._book.of_flight[flight.fid].values()}
+        apart = {t.fid for t in trees} | {s.tree for s in self._book.of_flight[flight.fid].values() if s.present}
         others = [
             t for t in self._book.trees.values()
             if t.site == flight.site and t.status != "merged" and t.fid not in apart
         ]  # fmt: skip
-        partner = assign(self._book.known(trees), self._book.known(others), self._config)
-        gained: set[int] = set()
-        for tree, k in zip(trees, partner, strict=True):
-            if k >= 0:
-                self._relink(tree, others[int(k)])
-                gained.add(others[int(k)].fid)
-        return gained
+        found = partners(Spots.of_trees(trees), [t.status == "present" for t in trees], others, self._config)
+        for tree, other in zip(trees, found, strict=True):
+            if other is not None:
+                self._relink(tree, other)
+        return {other.fid for other in found if other is not None}
 
     def _relink(self, left: InventoryTree, to: InventoryTree) -> None:
         """Make a tree's sightings another tree's; the tree they leave stays as merged, so that no number is lost."""

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from schemas.trees import Tree
 from services.inventory.book import Inventory
 from services.inventory.config import InventoryConfig
+from tests.unit.navigator_world import tree
 from tests.unit.test_inventory_merge import START, S, forest, listed, present, seen_from, take
 
 
@@ -51,3 +54,75 @@ def test_flights_without_a_start_point_come_to_the_globe_together() -> None:
     assert len(present(book)) == len(world)
     assert all(book.trees[k].flights == 3 for k in present(book))
     assert not any("local" in f.note for f in book.flights.values())
+
+
+SURE = InventoryConfig(start_points=(START.model_copy(update={"sigma_m": 0.05, "sigma_heading_deg": 0.3}),))
+"""Good enough to join trees directly."""
+
+
+def told(book: Inventory, map_id: str, *lists: list[Tree]) -> None:
+    """Take a flight's lists, one a second."""
+    for k, trees in enumerate(lists, start=1):
+        book.take(map_id, listed(trees, k * S, map_id=map_id, version=k), k * S)
+
+
+def test_a_trunk_that_its_flight_lists_under_another_id_stays_one_tree() -> None:
+    book = Inventory(SURE)
+    told(book, "m1", [tree(3, 4.0, 0.0)])
+    told(book, "m2", [tree(7, 4.05, 0.0)], [], [tree(12, 4.06, 0.0)])
+    assert present(book) == [1]
+    assert book.trees[1].flights == 2
+    assert {s.tree_id: s.present for s in book.of_flight[2].values()} == {7: False, 12: True}
+
+
+def test_an_id_that_changes_from_one_list_to_the_next_makes_no_second_tree() -> None:
+    book = Inventory(SURE)
+    told(book, "m1", [tree(3, 4.0, 0.0)])
+    told(book, "m2", [tree(7, 4.05, 0.0)], [tree(12, 4.06, 0.0)])
+    assert present(book) == [1]
+
+
+def test_an_id_that_comes_back_beside_the_one_that_took_its_tree_is_another_tree() -> None:
+    """The list holds both, and trees of one flight are never joined with each other."""
+    book = Inventory(SURE)
+    told(book, "m1", [tree(3, 4.0, 0.0)])
+    both = [tree(7, 4.25, 0.0), tree(12, 4.06, 0.0)]
+    told(book, "m2", [tree(7, 4.05, 0.0)], [], [tree(12, 4.06, 0.0)], both)
+    assert present(book) == [1, 2]
+    assert {s.tree_id: s.tree for s in book.of_flight[2].values()} == {7: 2, 12: 1}
+    assert [list(book.of_tree[k]) for k in (1, 2)] == [[1, 3], [2]]
+    told(book, "m3", [tree(1, 4.02, 0.0), tree(2, 4.26, 0.0)])
+    assert present(book) == [1, 2]
+
+
+def test_a_ghost_nearer_than_the_tree_is_not_brought_back() -> None:
+    book = Inventory(SURE)
+    told(book, "m1", [tree(3, 4.0, 0.0), tree(8, 4.13, 0.0)], [tree(3, 4.0, 0.0)])
+    told(book, "m2", [tree(1, 4.11, 0.0)])
+    assert present(book) == [1]
+    assert book.trees[1].flights == 2
+    assert book.trees[2].status == "withdrawn"
+
+
+def test_a_tree_that_no_list_holds_any_more_is_found_again_by_another_flight() -> None:
+    book = Inventory(SURE)
+    told(book, "m1", [tree(3, 4.0, 0.0)], [])
+    told(book, "m2", [tree(1, 4.1, 0.0)])
+    assert present(book) == [1]
+
+
+def test_flights_are_joined_by_their_present_trees_not_by_ghosts() -> None:
+    book = Inventory(InventoryConfig(start_points=(START,)))
+    world = forest(24)
+
+    def beside(by_m: float, first_id: int) -> list[Tree]:
+        return [t.model_copy(update={"id": first_id + t.id, "x_m": t.x_m + by_m * math.cos(t.id), "y_m": t.y_m + by_m * math.sin(t.id)})
+                for t in world]  # fmt: skip
+
+    told(book, "m1", [*world, *beside(0.12, 50)], world)
+    told(book, "m2", [*beside(0.09, 0), *beside(0.02, 50)], beside(0.09, 0))
+    while book.join_next(3 * S):
+        pass
+    assert book.flights[2].aligned
+    assert len(present(book)) == len(world)
+    assert all(book.trees[k].flights == 2 for k in present(book))
