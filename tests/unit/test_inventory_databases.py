@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import math
 import sqlite3
 import struct
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
+from services.common.errors import InputError
+from services.inventory.export import csv_bytes, geojson_bytes, tree_rows
 from services.inventory.geopackage import GeoPackage, point_blob
-from services.inventory.values import Changes
+from services.inventory.postgis import PostGis
+from services.inventory.values import AuditLine, Changes
 from tests.unit.test_inventory_merge import S, forest, listed
 from tests.unit.test_inventory_store import filled
 
@@ -66,3 +75,114 @@ def test_points_of_other_programs_are_read_by_the_index(tmp_path: Path) -> None:
         assert asked(other) == (None,) * 5
     store.write(Changes(), {})
     store.close()
+
+
+def test_exports_of_postgis_hold_the_times_as_those_of_a_geopackage(tmp_path: Path) -> None:
+    """PostgreSQL gives datetimes, in the session's time zone."""
+    path = tmp_path / "inventory.gpkg"
+    filled(path)
+    store = GeoPackage(path, read_only=True)
+    trees, sites = store.rows("trees"), store.rows("sites")
+    store.close()
+    given = [
+        row | {name: datetime.fromisoformat(row[name]).astimezone(timezone(timedelta(hours=2))) for name in ("first_seen", "last_seen")}
+        for row in trees
+    ]  # fmt: skip
+    rows = tree_rows(given, [], sites)
+    assert rows[0]["first_seen"] == datetime.fromtimestamp(1, UTC).strftime("%Y-%m-%dT%H:%M:%S.000Z")
+    expected = tree_rows(trees, [], sites)
+    assert csv_bytes(rows) == csv_bytes(expected)
+    assert geojson_bytes(rows) == geojson_bytes(expected)
+    assert json.dumps({"trees": rows})
+
+
+class RefusedError(Exception):
+    """Stands for psycopg.Error."""
+
+
+class Server:
+    """A database whose lock is free or taken; each connection keeps what was said to it."""
+
+    def __init__(self) -> None:
+        self.free, self.ill = True, False
+        self.connections: list[Connection] = []
+
+    def connect(self, *_: object, **__: object) -> Connection:
+        self.connections.append(Connection(self))
+        return self.connections[-1]
+
+
+class Connection:
+    """As much of psycopg's as is used."""
+
+    def __init__(self, server: Server) -> None:
+        self.server, self.closed, self.said, self.rows = server, False, "", 0
+
+    @contextmanager
+    def transaction(self) -> Iterator[None]:
+        yield
+
+    @contextmanager
+    def cursor(self) -> Iterator[Connection]:
+        yield self
+
+    def execute(self, query: str, _: object = None) -> Connection:
+        if self.server.ill:
+            raise RefusedError("terminating connection")
+        self.said = query
+        return self
+
+    def fetchone(self) -> dict[str, bool]:
+        assert "pg_try_advisory_lock" in self.said
+        return {"got": self.server.free}
+
+    def executemany(self, _: str, rows: list[object]) -> None:
+        self.rows += len(list(rows))
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.fixture
+def server(monkeypatch: pytest.MonkeyPatch) -> Server:
+    there, driver, its_rows = Server(), ModuleType("psycopg"), ModuleType("psycopg.rows")
+    monkeypatch.setattr(driver, "Error", RefusedError, raising=False)
+    monkeypatch.setattr(driver, "connect", there.connect, raising=False)
+    monkeypatch.setattr(its_rows, "dict_row", None, raising=False)
+    monkeypatch.setitem(sys.modules, "psycopg", driver)
+    monkeypatch.setitem(sys.modules, "psycopg.rows", its_rows)
+    return there
+
+
+NEWS = Changes(audit=[AuditLine(S, "uav1", "link", "info", "", "later")])
+
+
+def test_a_station_whose_place_another_took_meanwhile_writes_nothing(server: Server) -> None:
+    store = PostGis("postgresql://user@host/db")
+    server.connections[0].closed = True  # the server was restarted
+    server.free = False
+    for _ in range(2):
+        with pytest.raises(RefusedError, match="another station writes to it"):
+            store.write(NEWS, {})
+    server.free = True
+    store.write(NEWS, {})
+    assert [c.rows for c in server.connections] == [0, 0, 0, 1]
+    assert [c.closed for c in server.connections] == [True, True, True, False]
+
+
+def test_a_lock_that_was_not_answered_is_not_taken_for_ours(server: Server) -> None:
+    store = PostGis("postgresql://user@host/db")
+    server.connections[0].closed = server.ill = True
+    with pytest.raises(RefusedError, match="terminating"):
+        store.write(NEWS, {})
+    server.ill, server.free = False, False
+    with pytest.raises(RefusedError, match="another station"):
+        store.write(NEWS, {})
+    assert not any(c.rows for c in server.connections)
+
+
+def test_a_second_station_is_refused_at_its_start(server: Server) -> None:
+    server.free = False
+    with pytest.raises(InputError, match="another station writes to it"):
+        PostGis("postgresql://user@host/db")
+    assert server.connections[0].closed
