@@ -188,6 +188,17 @@ def test_two_arbiters_are_believed_by_nobody() -> None:
     assert "two arbiters answer (another, arbiter)" in desk.one.note
 
 
+def test_two_arbiters_of_one_name_are_believed_by_nobody() -> None:
+    """A book that was copied to a second station carries the name: the first answer was taken."""
+    desk = Desk()
+    desk.one.claim(goal(1))
+    asked = desk.one.questions(0)[0]
+    reply = desk.judged("one", asked.request, 0)
+    desk.one.answered(asked, [reply, reply.model_copy(update={"granted": False, "lease_s": 0.0})], 0)
+    assert desk.one.held is None
+    assert "two arbiters answer (arbiter, arbiter)" in desk.one.note
+
+
 def test_a_refused_renewal_is_told_and_not_repeated() -> None:
     desk = Desk()
     desk.one.claim(goal(1))
