@@ -50,13 +50,23 @@ class FleetRun:
     ) -> None:  # fmt: skip
         self._console, self._keep, self._begun_s = console, logs is not None, time.monotonic()
         self._folder, self._record = logs or scratch.made(), record
+        self._ground, self._crafts = fleet_configs(with_port(tree, fixed=fixed_port), aircraft, self._folder)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
+            self._forget_the_last()
         except OSError as error:
             raise InputError(f"--logs {self._folder}: cannot be written: {error.strerror}") from None
-        self._ground, self._crafts = fleet_configs(with_port(tree, fixed=fixed_port), aircraft, self._folder)
         for name, config in {"ground": self._ground, **self._crafts}.items():
             (self._folder / f"{name}.json").write_text(config.model_dump_json(indent=1))
+
+    def _forget_the_last(self) -> None:
+        """Remove what a run of before left in the folder: its trees done, which are the same, and what it came to."""
+        inventory = self._folder / "inventory.gpkg"
+        gone = [self._folder / "fleet.json", *(self._folder / uav / "summary.json" for uav in self._crafts)]
+        if self._ground.station.inventory.database == str(inventory):
+            gone += [inventory.with_name(inventory.name + tail) for tail in ("", "-wal", "-shm")]
+        for path in gone:
+            path.unlink(missing_ok=True)
 
     def to_the_end(self, *, as_json: bool, browser: bool) -> int:
         """Fly until all are down or the user stops it; print the summary and return the exit code.

@@ -118,13 +118,16 @@ class Book:
         return self._grant(lease, request, now_ns)
 
     def _renew(self, own: Lease, request: ClaimRequest, way: Stretch, now_ns: int) -> ClaimReply:
-        """Extend; the stretch shrinks as the aircraft goes along it, which is never nearer to anybody."""
+        """Extend; the stretch shrinks as the aircraft goes along it, which is never nearer to anybody.
+
+        Before a trunk the aircraft comes back: it backs off along what it came by, which stays its own.
+        """
         if math.dist(own.way.to_m, way.to_m) > _MOVED_M:
             held = self._conflict(own.uav, way)
             if held is not None:
                 return self._reply(request, None, f"the map moved: {self._who(held, way)}")
             return self._grant(replace(own, way=way), request, now_ns)
-        shrunk = Stretch(own.way.nearest(way.from_m), own.way.to_m, own.way.sigma_m)
+        shrunk = own.way.ahead_of(way.from_m, self.rules.keep_m if own.kind == "tree" else 0.0)
         until_ns = now_ns + _ns(own.lease_s)
         self.leases[own.uav, own.lease_id] = replace(own, way=shrunk, until_ns=max(until_ns, own.until_ns))
         return self._reply(request, own.lease_s, "renewed")

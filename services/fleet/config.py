@@ -17,6 +17,9 @@ class FleetConfig(BaseModel):
     separation_m: float = Field(default=3.0, gt=0.0)
     """No two claims of different aircraft come nearer: each may stand 0.95 m from its trunk on either side, is 0.35 m
     wide (``navigator.aircraft_radius_m``), and 0.4 m are left between them."""
+    keep_m: float = Field(default=2.0, ge=0.0, le=20.0)
+    """Of a way to a tree the last part stays claimed while the aircraft is docked: it backs off along it, by
+    ``navigator.undock_m`` (1.8 m) from the trunk; where that is larger, this has to be."""
     same_tree_m: float = Field(default=0.5, gt=0.0)
     """A tree this near to a visited one (and twice the doubt of both places) is that tree."""
     max_sigma_m: float = Field(default=0.5, gt=0.0)

@@ -187,11 +187,11 @@ class Holder:
             if self.asked is not None and asked.request.kind == "claim":
                 self.note = "the arbiter does not answer"
             return
-        names = sorted({r.arbiter for r in replies})
-        if len(names) > 1:
-            self.note = f"two arbiters answer ({', '.join(names)}): one station only may have station.fleet.enabled"
+        if len(replies) > 1:  # of one name too: a book that was copied to another station carries it
+            names = ", ".join(sorted(r.arbiter for r in replies))
+            self.note = f"two arbiters answer ({names}): one station only may have station.fleet.enabled"
             return
-        reply, self.arbiter = replies[0], names[0]
+        reply, self.arbiter = replies[0], replies[0].arbiter
         {"claim": self._on_claim, "renew": self._on_renew, "done": self._on_done, "release": self._on_release}[
             asked.request.kind
         ](asked, reply, now_ns)

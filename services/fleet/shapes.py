@@ -38,6 +38,16 @@ class Stretch:
         share = 0.0 if length2 == 0.0 else min(1.0, max(0.0, ((p[0] - ax) * dx + (p[1] - ay) * dy) / length2))
         return ax + share * dx, ay + share * dy
 
+    def ahead_of(self, p: Vec2, keep_m: float = 0.0) -> Stretch:
+        """Return what lies ahead of the place nearest to ``p``, and the last ``keep_m`` in any case."""
+        begin, length_m = self.nearest(p), math.dist(self.from_m, self.to_m)
+        if length_m <= keep_m:
+            begin = self.from_m
+        elif math.dist(begin, self.to_m) < keep_m:
+            (ax, ay), (bx, by), share = self.from_m, self.to_m, keep_m / length_m
+            begin = bx + share * (ax - bx), by + share * (ay - by)
+        return Stretch(begin, self.to_m, self.sigma_m)
+
     def doubt_m(self, other: Stretch) -> float:
         """Return two standard deviations of the distance between the two."""
         return 2.0 * math.hypot(self.sigma_m, other.sigma_m)

@@ -14,7 +14,7 @@ from schemas.trees import Tree, TreeList
 from services.inventory.config import InventoryConfig, StartPoint
 from services.inventory.geodesy import TangentPlane, place_of_start
 from services.inventory.joining import Joiner
-from services.inventory.merge import Spots, assign, fuse
+from services.inventory.merge import Spots, belief_of, fuse, partners
 from services.inventory.values import (
     Belief,
     Changes,
@@ -87,10 +87,9 @@ class Inventory:
         flight.stamp_ns, flight.version, flight.last_ns = trees.stamp_ns, trees.version, now_ns
         self.changes.flights[flight.fid] = flight
         seen = self.of_flight[flight.fid]
-        fresh = [tree for tree in trees.trees if tree.id not in seen]
-        self._link_new(flight, fresh, now_ns)
-        touched = self._update(flight, trees, now_ns)
-        self._withdraw(flight, trees, touched)
+        touched = self._withdraw(flight, trees)  # first: a trunk of this list may have had another id before
+        self._link_new(flight, trees, now_ns)
+        touched |= self._update(flight, trees, now_ns)
         for tree_id in visited & seen.keys():
             tree = self.trees[seen[tree_id].tree]
             if not tree.visited:
@@ -161,43 +160,50 @@ class Inventory:
 
     # -- trees
 
-    def _link_new(self, flight: Flight, fresh: list[Tree], now_ns: int) -> None:
-        """Give each tree that is new to the flight a tree of the inventory: a known one where the flight lies on it."""
+    def _link_new(self, flight: Flight, trees: TreeList, now_ns: int) -> None:
+        """Give each tree that is new to the flight a tree of the inventory: a known one where the flight lies on it.
+
+        So too one that comes back when another of the list has its tree: the flight tells the two apart.
+        """
+        seen = self.of_flight[flight.fid]
+        held = {s.tree for s in seen.values() if s.present}
+        fresh: list[Tree] = []
+        for tree in trees.trees:
+            before = seen.get(tree.id)
+            if before is None or (not before.present and before.tree in held):
+                fresh.append(tree)
+            else:
+                held.add(before.tree)
         beliefs = [belief_of(tree) for tree in fresh]
-        partners: list[int | None] = [None] * len(fresh)
-        if flight.aligned or self._precise(flight):
-            candidates = self._others(flight)
-            found = assign(self.placed(flight, beliefs), self.known(candidates), self._config)
-            partners = [candidates[k].fid if k >= 0 else None for k in found]
-        for tree, belief, partner in zip(fresh, beliefs, partners, strict=True):
-            fid = partner if partner is not None else self._new_tree(flight, now_ns)
-            number = self._next_sighting
+        found: list[InventoryTree | None] = [None] * len(fresh)
+        if fresh and (flight.aligned or self._precise(flight)):
+            others = [t for t in self.trees.values() if t.site == flight.site and t.status != "merged" and t.fid not in held]  # fmt: skip
+            found = partners(self.placed(flight, beliefs), [True] * len(fresh), others, self._config)
+        for tree, belief, partner in zip(fresh, beliefs, found, strict=True):
+            self._link(flight, tree.id, belief, partner.fid if partner is not None else self._new_tree(flight, now_ns))
+
+    def _link(self, flight: Flight, tree_id: int, belief: Belief, fid: int) -> None:
+        sighting = self.of_flight[flight.fid].get(tree_id)
+        if sighting is None:
+            sighting = Sighting(self._next_sighting, flight.fid, tree_id, fid, belief)
             self._next_sighting += 1
-            sighting = Sighting(number, flight.fid, tree.id, fid, belief)
-            self.sightings[number] = self.changes.sightings[number] = sighting
-            self.of_flight[flight.fid][tree.id] = sighting
-            self.of_tree.setdefault(fid, {})[number] = sighting
+        else:
+            del self.of_tree[sighting.tree][sighting.fid]
+            sighting.tree = fid
+        self.sightings[sighting.fid] = self.changes.sightings[sighting.fid] = sighting
+        self.of_flight[flight.fid][tree_id] = sighting
+        self.of_tree.setdefault(fid, {})[sighting.fid] = sighting
 
     def _precise(self, flight: Flight) -> bool:
         """Whether the start point alone is good enough to tell trunks apart, at 10 m from it."""
         reach = math.hypot(flight.sigma_m, 10.0 * flight.sigma_heading_rad)
         return flight.frame == "global" and 2.0 * reach < self._config.merge_m
 
-    def _others(self, flight: Flight) -> list[InventoryTree]:
-        """Return the site's trees that the flight has no part in yet."""
-        own = {sighting.tree for sighting in self.of_flight[flight.fid].values()}
-        return [t for t in self.trees.values() if t.site == flight.site and t.status != "merged" and t.fid not in own]
-
     def placed(self, flight: Flight, beliefs: list[Belief]) -> Spots:
         """Return beliefs in the frame of the flight's site."""
         at = [flight.place.apply(b.x_m, b.y_m, b.z_m) for b in beliefs]
         return Spots.of([(x, y, b.radius_m, b.sigma_xy_m, b.sigma_radius_m)
                          for (x, y, _), b in zip(at, beliefs, strict=True)])  # fmt: skip
-
-    @staticmethod
-    def known(trees: list[InventoryTree]) -> Spots:
-        """Return trees of the inventory as arrays."""
-        return Spots.of([(t.x_m, t.y_m, t.radius_m, t.sigma_xy_m, t.sigma_radius_m) for t in trees])
 
     def _new_tree(self, flight: Flight, now_ns: int) -> int:
         fid = self._next_tree
@@ -258,14 +264,16 @@ class Inventory:
         sighting.kept, sighting.kept_ns = belief, now_ns
         self.changes.measurements.append(Measurement(sighting.fid, sighting.tree, now_ns, stamp_ns, belief, x, y))
 
-    def _withdraw(self, flight: Flight, trees: TreeList, touched: set[int]) -> None:
-        """Mark what the list no longer holds; a tree that no flight's list holds any more stays, as withdrawn."""
+    def _withdraw(self, flight: Flight, trees: TreeList) -> set[int]:
+        """Mark what the list no longer holds, and return it; a tree that no list holds any more stays, as withdrawn."""
+        touched: set[int] = set()
         listed = {tree.id for tree in trees.trees}
         for tree_id, sighting in self.of_flight[flight.fid].items():
             if sighting.present and tree_id not in listed:
                 sighting.present = False
                 self.changes.sightings[sighting.fid] = sighting
                 touched.add(sighting.tree)
+        return touched
 
     def refresh(self, fid: int, now_ns: int) -> None:
         """Compute a tree anew from its flights' beliefs."""
@@ -275,7 +283,7 @@ class Inventory:
         parts = list(self.of_tree[fid].values())
         present = [s for s in parts if s.present]
         tree.status = "present" if present else "withdrawn"
-        used = present or parts
+        used = present or list({s.flight: s for s in parts}.values())  # one of each flight
         placed = []
         for sighting in used:
             b = sighting.belief
@@ -286,12 +294,6 @@ class Inventory:
         tree.flights = len({s.flight for s in used})
         tree.last_ns = now_ns
         self.changes.trees[fid] = tree
-
-
-def belief_of(t: Tree) -> Belief:
-    """Return a tree of a list as a belief."""
-    return Belief(t.x_m, t.y_m, t.z_m, t.radius_m, t.radius_height_m, t.height_seen_m, t.sigma_xy_m, t.sigma_radius_m,
-                  t.confidence, t.observations, t.suitable)  # fmt: skip
 
 
 def _moved(a: Belief, b: Belief, by_m: float, radius_m: float) -> bool:

@@ -6,9 +6,11 @@ import csv
 import io
 import json
 from collections.abc import Sequence
+from datetime import datetime
 from typing import Any
 
 from services.inventory.geodesy import TangentPlane
+from services.inventory.schema import utc
 
 Row = dict[str, Any]
 Cell = str | int | float | bool | None
@@ -42,11 +44,13 @@ def tree_rows(
     return sorted(rows, key=lambda row: int(row["tree_id"]))
 
 
-def _tidy(name: str, value: Cell) -> Cell:
+def _tidy(name: str, value: Cell | datetime) -> Cell:
     if name in ("suitable", "visited"):
         return bool(value)
     if isinstance(value, float):
         return round(value, 9 if name.endswith("_deg") else 4)
+    if isinstance(value, datetime):  # PostgreSQL's, in the session's time zone
+        return utc(value)
     return value
 
 

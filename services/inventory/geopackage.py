@@ -7,9 +7,11 @@ commit that was finished, and nothing of one that was not. Readers (QGIS) do not
 from __future__ import annotations
 
 import contextlib
+import math
 import sqlite3
 import struct
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +48,8 @@ CREATE TABLE gpkg_geometry_columns (table_name TEXT NOT NULL, column_name TEXT N
   CONSTRAINT fk_gc_srs FOREIGN KEY (srs_id) REFERENCES gpkg_spatial_ref_sys (srs_id));
 """
 _SRS = {schema.GLOBAL_TABLE: 4326, schema.LOCAL_TABLE: -1}
+_ENVELOPE_BYTES = {0: 0, 1: 32, 2: 48, 3: 48, 4: 64}
+"""After the header, by its code for what the envelope holds."""
 _ROWS: dict[str, Any] = {
     "sites": schema.site_row,
     "flights": schema.flight_row,
@@ -56,6 +60,38 @@ _ROWS: dict[str, Any] = {
 def point_blob(x: float, y: float, srs_id: int) -> bytes:
     """Return a point as GeoPackage stores it: the GP header (2.1.3.1), little endian, no envelope, then WKB."""
     return struct.pack("<2sBBi", b"GP", 0, 1, srs_id) + struct.pack("<BIdd", 1, 1, x, y)
+
+
+def point_in(blob: object) -> tuple[float, float] | None:
+    """Return x and y of a point as GeoPackage stores it, ours or another program's; NaN: it is empty. None: no such point."""
+    if not isinstance(blob, bytes) or blob[:2] != b"GP":
+        return None
+    try:
+        at = 8 + _ENVELOPE_BYTES[blob[3] >> 1 & 7]
+        order = "<" if blob[at] else ">"
+        x, y = struct.unpack_from(f"{order}dd", blob, at + 5)
+    except (struct.error, IndexError, KeyError):
+        return None
+    return x, y
+
+
+def _add_functions(db: sqlite3.Connection) -> None:
+    """Give the connection what the triggers of a spatial index call, which QGIS puts into the file (annex F.3)."""
+
+    def part(k: int) -> Callable[[object], float | None]:
+        def of(blob: object) -> float | None:
+            point = point_in(blob)
+            return None if point is None else point[k]
+
+        return of
+
+    def empty(blob: object) -> bool | None:
+        point = point_in(blob)
+        return None if point is None else math.isnan(point[0])
+
+    functions = {"ST_MinX": part(0), "ST_MaxX": part(0), "ST_MinY": part(1), "ST_MaxY": part(1), "ST_IsEmpty": empty}
+    for name, function in functions.items():
+        db.create_function(name, 1, function, deterministic=True)
 
 
 class GeoPackage:
@@ -73,6 +109,7 @@ class GeoPackage:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._db = sqlite3.connect(path, timeout=_BUSY_MS / 1e3, isolation_level=None, check_same_thread=False)
             self._db.row_factory = sqlite3.Row
+            _add_functions(self._db)
             if read_only:
                 self._db.execute("PRAGMA query_only = ON")
             else:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from services.inventory.align import Alignment, Prior, align
 from services.inventory.config import InventoryConfig
-from services.inventory.merge import assign
+from services.inventory.merge import Spots, partners
 from services.inventory.values import Flight, InventoryTree, Rigid2, Sighting
 
 if TYPE_CHECKING:
@@ -59,9 +59,8 @@ class Joiner:
         if flight.frame == "global":
             turn_rad, shift_m = max(flight.sigma_heading_rad, 0.01), max(flight.sigma_m, 0.1)
             prior = Prior(_PRIOR_SIGMAS * turn_rad * math.sqrt(2.0), _PRIOR_SIGMAS * shift_m * math.sqrt(2.0))
-        found = align(
-            self._book.placed(flight, [s.belief for s in sightings]), self._book.known(known), self._config, prior
-        )
+        placed = self._book.placed(flight, [s.belief for s in sightings])
+        found = align(placed, Spots.of_trees(known), self._config, prior)
         if found is not None:
             self._join(flight, site, found, now_ns)
 
@@ -75,44 +74,69 @@ class Joiner:
         )
 
     def _join(self, flight: Flight, site: int, found: Alignment, now_ns: int) -> None:
-        """Move the flight into the site by what was found, and its trees onto the trees there."""
-        place = flight.place
-        x, y, _ = Rigid2(found.theta_rad, *found.shift_m).apply(place.x_m, place.y_m, 0.0)
-        flight.place = replace(place, theta_rad=place.theta_rad + found.theta_rad, x_m=x, y_m=y)
-        flight.site, flight.frame, flight.aligned = site, self._book.sites[site].frame, True
-        flight.sigma_m, flight.sigma_heading_rad = max(found.rms_m, 0.02), 0.01
-        where = "" if flight.frame == "global" else "; local coordinates"
-        flight.note = f"laid on the inventory by {found.agreeing} trees, {found.rms_m:.2f} m{where}"
-        self._book.changes.flights[flight.fid] = flight
-        sightings = list(self._book.of_flight[flight.fid].values())
-        alone = [s for s in sightings if len(self._book.of_tree[s.tree]) == 1]
-        self._move_trees(flight, alone)
-        own = {s.tree for s in sightings}
-        others = [t for t in self._book.trees.values() if t.site == site and t.status != "merged" and t.fid not in own]
-        partner = assign(self._book.placed(flight, [s.belief for s in alone]), self._book.known(others), self._config)
-        for sighting, k in zip(alone, partner, strict=True):
-            if k >= 0:
-                self._relink(sighting, others[int(k)].fid)
-        for fid in sorted({s.tree for s in sightings}):
-            self._book.refresh(fid, now_ns)
+        """Lay the flight on the site by what was found, and its trees onto the trees there.
 
-    def _move_trees(self, flight: Flight, sightings: list[Sighting]) -> None:
-        for sighting in sightings:
-            tree = self._book.trees[sighting.tree]
-            if tree.frame == "local" and flight.frame == "global":
+        A site that it leaves comes along whole: its flights share trees, which cannot lie in two frames.
+        """
+        book, turn = self._book, Rigid2(found.theta_rad, *found.shift_m)
+        if site == flight.site:
+            along: list[Flight] = []
+            seen = {s.tree for s in book.of_flight[flight.fid].values()}
+            trees = [
+                book.trees[k] for k in sorted(seen) if all(s.flight == flight.fid for s in book.of_tree[k].values())
+            ]
+        else:
+            along = [f for f in book.flights.values() if f.site == flight.site and f is not flight]
+            trees = [t for t in book.trees.values() if t.site == flight.site]
+        self._lay(flight, site, turn, f"by {found.agreeing} trees, {found.rms_m:.2f} m")
+        flight.sigma_m, flight.sigma_heading_rad = max(found.rms_m, 0.02), 0.01
+        for other in along:
+            self._lay(other, site, turn, f"with flight {flight.fid}")
+            other.sigma_m = math.hypot(other.sigma_m, flight.sigma_m)
+            other.sigma_heading_rad = math.hypot(other.sigma_heading_rad, flight.sigma_heading_rad)
+        self._move_trees(trees, site, turn)
+        gained = self._merge(flight, [t for t in trees if t.status != "merged"])
+        for fid in sorted(gained | {s.tree for s in book.of_flight[flight.fid].values()}):
+            book.refresh(fid, now_ns)
+
+    def _lay(self, flight: Flight, site: int, turn: Rigid2, by: str) -> None:
+        place = flight.place
+        x, y, _ = turn.apply(place.x_m, place.y_m, 0.0)
+        flight.place = replace(place, theta_rad=place.theta_rad + turn.theta_rad, x_m=x, y_m=y)
+        flight.site, flight.frame, flight.aligned = site, self._book.sites[site].frame, True
+        flight.note = f"laid on the inventory {by}{'' if flight.frame == 'global' else '; local coordinates'}"
+        self._book.changes.flights[flight.fid] = flight
+
+    def _move_trees(self, trees: list[InventoryTree], site: int, turn: Rigid2) -> None:
+        frame = self._book.sites[site].frame
+        for tree in trees:
+            if tree.frame == "local" and frame == "global":
                 self._book.changes.placed.append(tree.fid)
-            tree.site, tree.frame = flight.site, flight.frame
+            tree.x_m, tree.y_m, _ = turn.apply(tree.x_m, tree.y_m, 0.0)
+            tree.site, tree.frame = site, frame
             self._book.changes.trees[tree.fid] = tree
 
-    def _relink(self, sighting: Sighting, to: int) -> None:
-        """Make a sighting one of another tree; the tree it leaves stays as merged, so that no number is lost."""
-        left = self._book.trees[sighting.tree]
-        left.status, left.merged_into = "merged", to
+    def _merge(self, flight: Flight, trees: list[InventoryTree]) -> set[int]:
+        """Make trees those of the flight's site that they are; return these."""
+        apart = {t.fid for t in trees} | {s.tree for s in self._book.of_flight[flight.fid].values() if s.present}
+        others = [
+            t for t in self._book.trees.values()
+            if t.site == flight.site and t.status != "merged" and t.fid not in apart
+        ]  # fmt: skip
+        found = partners(Spots.of_trees(trees), [t.status == "present" for t in trees], others, self._config)
+        for tree, other in zip(trees, found, strict=True):
+            if other is not None:
+                self._relink(tree, other)
+        return {other.fid for other in found if other is not None}
+
+    def _relink(self, left: InventoryTree, to: InventoryTree) -> None:
+        """Make a tree's sightings another tree's; the tree they leave stays as merged, so that no number is lost."""
+        left.status, left.merged_into = "merged", to.fid
+        to.visited |= left.visited
+        to.first_ns = min(to.first_ns, left.first_ns)
         self._book.changes.trees[left.fid] = left
-        if left.visited:
-            self._book.trees[to].visited = True
-        self._book.trees[to].first_ns = min(self._book.trees[to].first_ns, left.first_ns)
-        del self._book.of_tree[left.fid][sighting.fid]
-        self._book.of_tree[to][sighting.fid] = sighting
-        sighting.tree = to
-        self._book.changes.sightings[sighting.fid] = sighting
+        for sighting in self._book.of_tree[left.fid].values():
+            sighting.tree = to.fid
+            self._book.changes.sightings[sighting.fid] = sighting
+        self._book.of_tree[to.fid] |= self._book.of_tree[left.fid]
+        self._book.of_tree[left.fid] = {}

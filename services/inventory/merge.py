@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.trees import Tree
 from services.inventory.config import InventoryConfig
-from services.inventory.values import Belief
+from services.inventory.values import Belief, InventoryTree
 
 Array = NDArray[np.float64]
 
@@ -37,6 +38,11 @@ class Spots:
         """Return the arrays of rows (x, y, radius, sigma_xy, sigma_radius)."""
         table = np.array(rows, dtype=np.float64).reshape(-1, 5)
         return Spots(table[:, :2], table[:, 2], table[:, 3], table[:, 4])
+
+    @staticmethod
+    def of_trees(trees: Iterable[InventoryTree]) -> Spots:
+        """Return trees of the inventory as arrays."""
+        return Spots.of([(t.x_m, t.y_m, t.radius_m, t.sigma_xy_m, t.sigma_radius_m) for t in trees])
 
     def at(self, rows: NDArray[np.int64]) -> Spots:
         """Return some of the trees."""
@@ -92,6 +98,34 @@ def assign(new: Spots, known: Spots, config: InventoryConfig) -> NDArray[np.int6
             found[row] = column
             taken.add(column)
     return found
+
+
+def partners(
+    new: Spots, present: Sequence[bool], known: Sequence[InventoryTree], config: InventoryConfig
+) -> list[InventoryTree | None]:
+    """Return for each new tree the known one that it is, or None; none is given twice.
+
+    Trees that are ``present`` in a list come before withdrawn ones, on both sides: else a ghost that was withdrawn
+    beside a trunk would take the trunk's place.
+    """
+    found: list[InventoryTree | None] = [None] * len(new)
+    taken: set[int] = set()
+    spots = Spots.of_trees(known)
+    for mine, theirs in ((True, True), (True, False), (False, True), (False, False)):
+        rows = [i for i, here in enumerate(present) if here == mine and found[i] is None]
+        columns = [k for k, t in enumerate(known) if (t.status == "present") == theirs and k not in taken]
+        pairs = assign(new.at(np.array(rows, dtype=np.int64)), spots.at(np.array(columns, dtype=np.int64)), config)
+        for row, k in zip(rows, pairs, strict=True):
+            if k >= 0:
+                found[row] = known[columns[int(k)]]
+                taken.add(columns[int(k)])
+    return found
+
+
+def belief_of(t: Tree) -> Belief:
+    """Return a tree of a list as a belief."""
+    return Belief(t.x_m, t.y_m, t.z_m, t.radius_m, t.radius_height_m, t.height_seen_m, t.sigma_xy_m, t.sigma_radius_m,
+                  t.confidence, t.observations, t.suitable)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

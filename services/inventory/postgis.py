@@ -21,6 +21,7 @@ class Cursor(Protocol):
 _SRID = {schema.GLOBAL_TABLE: 4326, schema.LOCAL_TABLE: 0}
 _LOCK = 0x74726565
 """Of the advisory lock: one station writes at a time."""
+_TAKEN = "another station writes to it"
 
 
 class PostGis:
@@ -58,9 +59,8 @@ class PostGis:
 
     def _create(self) -> None:
         with self._db.transaction():
-            lock = self._db.execute("SELECT pg_try_advisory_lock(%s) AS got", (_LOCK,)).fetchone()
-            if not lock["got"]:
-                raise InputError(f"inventory {self.path}: another station writes to it")
+            if not self._locks():
+                raise InputError(f"inventory {self.path}: {_TAKEN}")
             self._db.execute("CREATE EXTENSION IF NOT EXISTS postgis")
             for table, body in schema.TABLES.items():
                 key = "BIGSERIAL" if table in {"measurements", "events"} else "BIGINT"
@@ -71,6 +71,23 @@ class PostGis:
                     f"{_postgres(body)})"
                 )
             self._db.execute("CREATE INDEX IF NOT EXISTS measurements_of_tree ON measurements (tree_id)")
+
+    def _locks(self) -> bool:
+        """Take the lock, which is the connection's, and say whether it is ours."""
+        return bool(self._db.execute("SELECT pg_try_advisory_lock(%s) AS got", (_LOCK,)).fetchone()["got"])
+
+    def _open_again(self) -> None:
+        """Connect anew; a connection without the lock is not kept: two stations would give the same numbers to trees."""
+        self._db = self._open()
+        ours = False
+        try:
+            with self._db.transaction():
+                ours = self._locks()
+        finally:
+            if not ours:
+                self._db.close()
+        if not ours:
+            raise self.failure(_TAKEN)
 
     def load(self) -> Contents:
         """Return everything but history and log."""
@@ -87,12 +104,11 @@ class PostGis:
         """Write all changes in one transaction.
 
         Raises:
-            psycopg.Error: the server refused or is gone; nothing was written then, and it is connected to again next time.
+            psycopg.Error: the server refused or is gone, or another station writes there by now; nothing was written
+                then, and it is connected to again next time.
         """
         if self._db.closed:
-            self._db = self._open()
-            with self._db.transaction():
-                self._db.execute("SELECT pg_try_advisory_lock(%s)", (_LOCK,))
+            self._open_again()
         with self._db.transaction(), self._db.cursor() as cursor:
             self._upsert(cursor, "sites", [schema.site_row(v) for v in changes.sites.values()])
             self._upsert(cursor, "flights", [schema.flight_row(v) for v in changes.flights.values()])

@@ -73,10 +73,13 @@ def kinds(table: str) -> list[str]:
 
 
 def iso(time_ns: int) -> str:
-    """Return a time as GeoPackage writes it: UTC with milliseconds."""
-    return (
-        datetime.fromtimestamp(time_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%S.") + f"{time_ns // 10**6 % 1000:03d}Z"
-    )
+    """Return a time as GeoPackage writes it; see ``utc``."""
+    return utc(datetime.fromtimestamp(time_ns // 10**9, UTC).replace(microsecond=time_ns % 10**9 // 1000))
+
+
+def utc(moment: datetime) -> str:
+    """Return a moment as GeoPackage writes it: UTC with milliseconds."""
+    return f"{moment.astimezone(UTC).strftime('%Y-%m-%dT%H:%M:%S.%f')[:-3]}Z"
 
 
 def _belief(b: Belief) -> tuple[Any, ...]:

@@ -188,6 +188,17 @@ def test_two_arbiters_are_believed_by_nobody() -> None:
     assert "two arbiters answer (another, arbiter)" in desk.one.note
 
 
+def test_two_arbiters_of_one_name_are_believed_by_nobody() -> None:
+    """A book that was copied to a second station carries the name: the first answer was taken."""
+    desk = Desk()
+    desk.one.claim(goal(1))
+    asked = desk.one.questions(0)[0]
+    reply = desk.judged("one", asked.request, 0)
+    desk.one.answered(asked, [reply, reply.model_copy(update={"granted": False, "lease_s": 0.0})], 0)
+    assert desk.one.held is None
+    assert "two arbiters answer (arbiter, arbiter)" in desk.one.note
+
+
 def test_a_refused_renewal_is_told_and_not_repeated() -> None:
     desk = Desk()
     desk.one.claim(goal(1))
@@ -213,9 +224,9 @@ def test_a_way_shrinks_as_it_is_flown_and_never_grows() -> None:
     desk = Desk()
     desk.one.claim(goal(1))
     desk.talk(desk.one, 0)
-    for at in ((10.3, 1.0), (10.0, 3.9)):
+    for at in ((10.3, 2.6), (10.0, 3.9)):
         desk.judged("one", ClaimRequest(kind="renew", lease_id=1, goal=goal(1).model_copy(update={"from_m": at})), S)
-    assert desk.book.leases["one", 1].way.from_m == (10.0, 1.0)
+    assert desk.book.leases["one", 1].way.from_m == (10.0, 2.6)
 
 
 def test_questions_are_repeated_only_after_a_while() -> None:
@@ -227,3 +238,23 @@ def test_questions_are_repeated_only_after_a_while() -> None:
     assert again == [Asked(replace(again[0]).request, S)]
     holder.answered(again[0], [], 2 * S)
     assert holder.note == "the arbiter does not answer"
+
+
+def test_an_aircraft_backs_off_from_its_trunk_within_its_own_claim() -> None:
+    """The stretch shrank to where it had docked, for good: another's way was granted 2.2 m from where it came to stand."""
+    desk = Desk()
+    desk.one.claim(ClaimGoal(kind="tree", map_id="m", from_m=(0.0, 0.0), to_m=(10.0, 0.0), tree_id=1))
+    desk.talk(desk.one, 0)
+    desk.one.at((9.05, 0.0), None, "m")  # docked
+    assert desk.talk(desk.one, 4 * S)[0].reason == "renewed"
+    behind = ClaimGoal(kind="tree", map_id="m", from_m=(6.0, 4.0), to_m=(6.0, 0.0), tree_id=2)
+    desk.two.claim(behind)  # 3.05 m behind the docked one, 2.2 m behind where it undocks to
+    assert "one is too near" in desk.talk(desk.two, 5 * S)[0].reason
+    desk.two.claim(behind.model_copy(update={"from_m": (4.9, 4.0), "to_m": (4.9, 0.0)}))
+    assert desk.talk(desk.two, 6 * S)[-1].granted, "what lies farther back is free"
+
+
+def test_a_way_that_was_claimed_shorter_than_the_keep_grows_by_nothing() -> None:
+    way = Stretch((9.0, 0.0), (10.0, 0.0))
+    assert way.ahead_of((9.5, 0.3), keep_m=2.0) == way
+    assert way.ahead_of((9.5, 0.3)) == Stretch((9.5, 0.0), (10.0, 0.0))

@@ -8,14 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from schemas.fleet import ClaimGoal
 from services.cli.app import invoke
-from services.cli.run_fleet import _summary, fleet_configs, fleet_figures, fleet_lines
+from services.cli.run_fleet import FleetRun, _summary, fleet_configs, fleet_figures, fleet_lines
 from services.cli.run_plan import services_for
 from services.common.config import TreedockConfig
 from services.common.errors import InputError
 from services.common.geometry import rotation_z
+from services.fleet.book import Done, Memory
+from services.fleet.journal import Journal
 from services.fleet.placing import SharedFrame
 from services.inventory.config import InventoryConfig
 from services.navigator.config import NavigatorConfig
@@ -109,6 +112,29 @@ def test_what_an_aircraft_said_last_stands_for_a_summary_it_did_not_give(tmp_pat
     assert _summary(tmp_path)["mission"]["reason"] == "no scene 'nowhere'"
     (tmp_path / "summary.json").write_text('{"mission": {"state": "landed"}}\n')
     assert _summary(tmp_path)["mission"]["state"] == "landed"
+
+
+def test_a_second_flight_with_the_same_logs_begins_without_the_first_ones_book_trees_and_summaries(
+    tmp_path: Path,
+) -> None:
+    tree = TreedockConfig(simulator=SimulatorConfig(seed=2, trees=4))
+    book = Journal(tmp_path / "fleet.json", (48.1, 11.5, 0.0))
+    book.write(Memory(done=(Done("uav1", (3.0, 1.0), 0.05, 4),)))
+    book.close()
+    for name in (
+        "inventory.gpkg",
+        "inventory.gpkg-wal",
+        "inventory.gpkg-shm",
+        "notes.txt",
+        "uav1/summary.json",
+        "old/summary.json",
+    ):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text('{"mission": {"state": "landed"}}\n')
+    FleetRun(tree, 2, Console(), tmp_path, None, fixed_port=True)
+    left = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
+    assert left - {"ground.json", "uav1.json", "uav2.json", ".fleet.json.lock"} == {"notes.txt", "old/summary.json"}
+    assert _summary(tmp_path / "uav1")["mission"].get("state") is None
 
 
 @pytest.mark.parametrize("flags", [["--join"], ["--autopilot", "udpin:0.0.0.0:14540"]])

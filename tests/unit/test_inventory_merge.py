@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 
 from schemas.trees import Tree, TreeList
 from services.inventory.align import Prior, align
-from services.inventory.book import Inventory, belief_of
+from services.inventory.book import Inventory
 from services.inventory.config import InventoryConfig, StartPoint
 from services.inventory.geodesy import TangentPlane, earth_from_geodetic, geodetic_from_earth, place_of_start
-from services.inventory.merge import Spots, assign, fuse
+from services.inventory.merge import Spots, assign, belief_of, fuse
 from services.inventory.values import Contents
 from tests.unit.navigator_world import tree
 
