@@ -87,6 +87,7 @@ class Claims:
         now_ns = self._steady_ns()
         leases = [
             {
+                "id": str(lease.lease_id),  # a number of 62 bits, which a page would round
                 "uav": lease.uav,
                 "kind": lease.kind,
                 "tree": lease.tree_id,

@@ -28,7 +28,7 @@ class StationConfig(BaseModel):
     """PEM file of the authority whose certificates browsers must show; the token is then not asked for."""
     aircraft: tuple[str, ...] = Field(default=(), max_length=64)
     """Names of the aircraft to show; empty: all that are heard."""
-    max_aircraft: int = Field(default=24, ge=1, le=256)
+    max_aircraft: int = Field(default=32, ge=1, le=256)
     """Further ones are refused and told: a stranger must not fill the memory."""
     max_browsers: int = Field(default=24, ge=1, le=256)
     page_hz: float = Field(default=5.0, gt=0.0, le=30.0)

@@ -24,12 +24,10 @@ from schemas.command import CommandReply
 from schemas.envelope import Message
 from schemas.health import Health
 from schemas.preview import PreviewImage
-from schemas.sketch import SubmapSketch
 from schemas.topics import (
     FLEET_HELD,
     FUSION_STATE,
     HEALTH,
-    MAP_SKETCH,
     MISSION_STATE,
     PREFIX,
     PREVIEW_IMAGE,
@@ -47,7 +45,7 @@ from services.navigator.client import send_command
 from services.station.aircraft import Aircraft
 from services.station.brain import Brain, Outgoing
 from services.station.claims import Claims
-from services.station.cloud import CloudView
+from services.station.clouds import Clouds
 from services.station.ears import Ears
 from services.station.guard import Guard
 from services.station.keeping import Keeping
@@ -63,7 +61,8 @@ _TOKEN_RING = 1_024
 _TREES_RING = 8  # 1.6 s of an aircraft that tells five times a second
 _ORDERS_AT_ONCE = 8
 _NOT_ABOARD = frozenset({"router", "recorder"})
-_CLOUD_ASKS, _CLOUD_TIMEOUT_S, _CLOUD_AGAIN_S = 12, 5.0, 5.0
+_NEVER_TOO_LATE = frozenset({"hold", "land", "abort"})
+"""Orders that make safe: whatever has happened since they were given, they are meant."""
 _TOPICS: dict[Topic, Callable[[Aircraft, Any], object]] = {
     SLAM_POSE: Aircraft.on_pose, MISSION_STATE: Aircraft.on_mission, VEHICLE_STATE: Aircraft.on_vehicle,
     TREES_TARGET: Aircraft.on_target, HEALTH: Aircraft.on_health, FLEET_HELD: Aircraft.on_held, FUSION_STATE: Aircraft.on_fusion,
@@ -86,9 +85,8 @@ class Station:
         token = self._token()
         self.site = Site(self.config, Guard(token, local=self.config.local), Ears(self.call, lambda: self.brain))
         self.brain = Brain(self.config, self.site, self._send_order, time.time_ns)
-        self.brain.on_cloud_wish = self._on_cloud_wish
-        self._clouds: dict[str, CloudView] = {}
-        self._clouds_asked_s: dict[str, float] = {}
+        self.clouds = Clouds(self.brain.cloud_watchers, self.site.one, self.call)
+        self.brain.on_cloud_wish = lambda uav: self.clouds.wish(uav, self._buses[uav])
         self.keeping = Keeping(self.config.inventory, self.brain.log, context.health, self.call)
         self.site.downloads = self.keeping.downloads()
         self.claims = self._arbiter()
@@ -224,62 +222,22 @@ class Station:
         self._context.health.count("messages")
         self.site.latest(f"preview/{aircraft.uav}", frame_of(aircraft.uav, message.jpeg))
 
-    # -- the cloud, while somebody looks
-
-    def _on_cloud_wish(self, uav: str) -> None:
-        """Ask for the whole map; follow its changes from then on."""
-        bus = self._buses[uav]
-        self._clouds_asked_s[uav] = time.monotonic()
-        if uav not in self._clouds:
-            self._clouds[uav] = CloudView(uav)
-            bus.subscribe(MAP_SKETCH, functools.partial(self._on_sketch, uav))
-
-        def ask() -> None:
-            held: set[int] = set()
-            for _ in range(
-                _CLOUD_ASKS
-            ):  # big answers are dropped where the network is full: asked for until none is new
-                found = bus.ask(MAP_SKETCH, None, SubmapSketch, _CLOUD_TIMEOUT_S)
-                fresh = [submap for submap in found if submap.submap_id not in held]
-                for submap in fresh:
-                    self.call(functools.partial(self._on_sketch, uav, submap))
-                if not fresh:
-                    return
-                held |= {submap.submap_id for submap in fresh}
-
-        self._pool.submit(ask)
-
-    def _on_sketch(self, uav: str, sketch: SubmapSketch) -> None:
-        pages = self.brain.cloud_watchers(uav)
-        if pages and uav in self._clouds:
-            for key, frame in self._clouds[uav].take(sketch):
-                for page in pages:
-                    self.site.one(page, frame, key)
-
-    def _end_unwatched_clouds(self) -> None:
-        """Stop listening to what no page looks at: the radio has better to carry."""
-        for uav in [uav for uav in self._clouds if not self.brain.cloud_watchers(uav)]:
-            self._buses[uav].unsubscribe(MAP_SKETCH)
-            del self._clouds[uav]
-
-    def _ask_again_for_clouds(self) -> None:
-        """Ask now and then until something comes: a page may look before there is a mapper, or a map."""
-        now_s = time.monotonic()
-        for uav, view in self._clouds.items():
-            if view.empty and now_s - self._clouds_asked_s.get(uav, 0.0) > _CLOUD_AGAIN_S:
-                self._on_cloud_wish(uav)
-
     # -- orders
 
     def _send_order(self, order: Outgoing) -> None:
-        bus = self._buses[order.uav]
+        bus, given_s = self._buses[order.uav], time.monotonic()
 
         def ask() -> None:
             reply: CommandReply | None = None
-            try:
-                reply = send_command(bus, order.name, order.tree_id, order.sender, self.config.command_timeout_s)
-            except zenoh.ZError as error:  # the session is closing or the router away
-                LOG.warning("order %s to %s failed: %s", order.name, order.uav, error)
+            waited_s = time.monotonic() - given_s
+            if waited_s > self.config.view_stale_s and order.name not in _NEVER_TOO_LATE:
+                reason = f"it waited {waited_s:.1f} s in the station behind other orders: look, and press again"
+                reply = CommandReply(accepted=False, reason=reason, state="unknown")
+            else:
+                try:
+                    reply = send_command(bus, order.name, order.tree_id, order.sender, self.config.command_timeout_s)
+                except zenoh.ZError as error:  # the session is closing or the router away
+                    LOG.warning("order %s to %s failed: %s", order.name, order.uav, error)
             self.call(lambda: self.brain.on_answer(order, reply))
 
         self._pool.submit(ask)
@@ -288,8 +246,7 @@ class Station:
 
     def _each_second(self) -> None:
         self.brain.tell_trees()
-        self._end_unwatched_clouds()
-        self._ask_again_for_clouds()
+        self.clouds.each_second()
         passed: Counter[str] = Counter()
         for bus in self._buses.values():
             bus.count_overflows()
@@ -307,6 +264,7 @@ class Station:
             self.claims.close()
         self.keeping.close()
         self._server.stop()
+        self.clouds.close()
         self._pool.shutdown(wait=False, cancel_futures=True)
 
 

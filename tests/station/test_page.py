@@ -174,6 +174,63 @@ def test_several_aircraft_side_by_side(ground: Ground, page: Page, monkeypatch: 
     assert "it jumped by 10.2 m" in systems(page)
 
 
+WATCH_ORDERS = """() => {
+    const link = window.treedock.link, send = link.send.bind(link);
+    window.orders = [];
+    link.send = (m) => { if (['order', 'take', 'release'].includes(m.t)) window.orders.push([m.t, m.uav]); return send(m); };
+}"""
+
+
+def two_aircraft(ground: Ground, page: Page) -> None:
+    """Have uav1 and uav2 heard, and uav2 chosen."""
+    for number in (1, 2):
+        ground.aircraft(f"uav{number}", seed=number)
+        true(page, f"window.treedock.crafts.size === {number}", 60.0)
+    page.click(".chip >> nth=2")
+    true(page, "document.getElementById('who-uav').innerText === 'uav2'", 10.0)
+    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=45_000)
+    page.evaluate(WATCH_ORDERS)
+
+
+def test_a_press_is_for_the_aircraft_it_began_with(ground: Ground, page: Page) -> None:
+    two_aircraft(ground, page)
+    for button in ("#order-start", "#take"):
+        page.evaluate("""() => {
+            window.treedock.choose('uav2');
+            addEventListener('pointerdown', () => setTimeout(() => window.treedock.choose('uav1'), 100), {once: true});
+        }""")
+        held(page, button)
+        assert page.evaluate("window.orders") == []
+        assert "Another aircraft was chosen" in toast(page)
+
+
+def test_a_new_station_does_not_turn_the_page_to_another_aircraft(ground: Ground, page: Page) -> None:
+    two_aircraft(ground, page)
+    held(page, "#order-start")
+    true(page, "window.treedock.craft.trees.length > 2", 30.0)
+    page.evaluate("window.orders.length = 0")
+    for name in ("station", "uav2"):
+        ground.kill(name)
+    ground.station()
+    true(
+        page, "window.treedock.link.up && window.treedock.link.state.aircraft.map((v) => v.uav).join() === 'uav1'", 30.0
+    )
+    page.wait_for_timeout(1_000)
+    assert page.evaluate("window.treedock.craft.uav") == "uav2"
+    assert page.inner_text("#who-uav") == "uav2"
+    assert "uav2 IS NOT HEARD" in page.inner_text("#alarm")
+    assert page.get_attribute("body", "data-old") == "true"
+    assert page.evaluate("window.treedock.craft.trees.length") > 2, "its last view stays"
+    page.keyboard.press("h")
+    assert toast(page) == "HOLD: uav2 is not heard."
+    held(page, "#order-land")
+    assert page.evaluate("window.orders") == []
+    ground.aircraft("uav2", seed=2)
+    page.wait_for_selector("#alarm", state="hidden", timeout=45_000)
+    page.wait_for_selector("#order-start:not([aria-disabled])", timeout=45_000)
+    assert page.inner_text("#who-uav") == "uav2"
+
+
 def test_the_keyboard_alone_is_enough(ground: Ground, page: Page) -> None:
     ground.aircraft("uav1")
     page.wait_for_selector("#order-start:not([aria-disabled])", timeout=45_000)

@@ -22,6 +22,7 @@ from services.common.bus import Bus
 from services.common.context import HealthBook
 from services.common.session import opened_client
 from services.evaluate.station_ground import page_socket
+from services.station.config import StationConfig
 from tests.station.conftest import Ground, until
 
 if TYPE_CHECKING:
@@ -246,7 +247,7 @@ def test_strangers_keys_and_names_do_no_harm(ground: Ground) -> None:
         ):
             for junk in (b"", b"\xff" * 100, b"\x81\xa1" * 50, bytes(100_000)):
                 session.put(f"{PREFIX}/uav1/{key}", junk)
-        assert until(lambda: len(client.aircraft()) == 24, 10.0)  # station.max_aircraft
+        assert until(lambda: len(client.aircraft()) == StationConfig().max_aircraft, 10.0)
         assert "uav1" in client.aircraft()
         assert all(len(uav) <= 64 for uav in client.aircraft())
         for token in tokens:

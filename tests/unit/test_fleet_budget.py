@@ -6,6 +6,7 @@ import pytest
 
 from schemas.topics import TOPICS, Reach
 from services.evaluate import fleet_budget as budget
+from services.station.config import StationConfig
 
 
 def test_the_page_shows_the_arithmetic_as_it_is() -> None:
@@ -22,3 +23,7 @@ def test_rates_are_those_behind_the_thinning_radio() -> None:
     assert budget.rate_hz(pose) == pose.radio_hz
     assert budget.bytes_per_s(pose) == pytest.approx(5 * (591 + 90))
     assert budget.thinned_bytes_per_s() < 0.2 * sum(budget.bytes_per_s(t) for t in budget.steady())
+
+
+def test_a_station_as_it_comes_carries_a_cell_and_some_who_come_over() -> None:
+    assert StationConfig().max_aircraft >= budget.CELL + 5

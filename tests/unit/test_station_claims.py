@@ -83,7 +83,7 @@ def test_the_page_is_told_who_holds_what(ground: Ground) -> None:
     ground.now_ns += 10 * S
     told = json.loads(ground.brain._state_text(0.0))
     assert told["fleet"] == {
-        "leases": [{"uav": "uav1", "kind": "tree", "tree": 1, "left": 30.0}],
+        "leases": [{"id": "1", "uav": "uav1", "kind": "tree", "tree": 1, "left": 30.0}],
         "visited": 0,
         "waits": 0.0,
     }

@@ -70,6 +70,7 @@ export function drawAlarm(page, craft, now) {
 function alarmWords(page, craft, now) {
   const others = [...page.crafts.values()].filter((c) => c !== craft && c.link(now) === "lost"), vehicle = craft?.view?.vehicle;
   if (!page.link.up) return page.link.everUp ? "STATION OUT OF REACH: what you see is old, no order will arrive" : "";
+  if (craft && !craft.heard) return `${craft.uav} IS NOT HEARD by this station: what you see is old, no order will arrive`;
   if (craft?.link(now) === "lost") return `LINK TO ${craft.uav} LOST for ${duration(craft.linkAge(now))}: what you see is old`;
   if (vehicle?.override) return "THE PILOT HAS THE AIRCRAFT: the mission is silent";
   if (vehicle?.armed && vehicle.battery !== null && vehicle.battery < BATTERY_LOW) return `BATTERY LOW: ${Math.round(vehicle.battery * 100)} %`;

@@ -41,7 +41,11 @@ export function keyed(parent, items, key, make, update) {
     if (node === at) at = at.nextElementSibling;
     else parent.insertBefore(node, at);
   }
-  for (const node of old.values()) node.remove();
+  while (at) { // all that was visited stands before it
+    const gone = at;
+    at = at.nextElementSibling;
+    gone.remove();
+  }
 }
 
 export const words = (name) => String(name).replaceAll("_", " ");

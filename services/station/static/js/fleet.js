@@ -21,7 +21,7 @@ export function drawFleet(page, now) {
     set(dot, "data-level", link);
     set(dot, "hidden", craft ? null : "");
     text(box.firstChild, craft ? craft.uav : "All");
-    text(box.lastChild, craft ? (link === "lost" ? "link lost" : words(craft.view?.mission?.state ?? "no mission")) : `${page.crafts.size} aircraft`);
+    text(box.lastChild, craft ? (link === "lost" ? craft.silence : words(craft.view?.mission?.state ?? "no mission")) : `${page.crafts.size} aircraft`);
     set(node, "title", craft ? craft.uav : null);
     set(node, "aria-pressed", craft ? !page.grid && craft === page.craft : page.grid);
   });
@@ -45,7 +45,7 @@ export function drawTiles(page, now) {
     set(node, "aria-current", c === page.craft ? "true" : null);
     text(name, c.uav);
     text(right, v?.vehicle?.battery == null ? "" : `${Math.round(v.vehicle.battery * 100)} %`);
-    text(reason, link === "lost" ? `link lost, ${duration(c.linkAge(now))}` : v?.mission ? `${TITLES[v.mission.state] ?? words(v.mission.state)}: ${v.mission.reason}` : "no mission is heard");
+    text(reason, link === "lost" ? `${c.silence}, ${duration(c.linkAge(now))}` : v?.mission ? `${TITLES[v.mission.state] ?? words(v.mission.state)}: ${v.mission.reason}` : "no mission is heard");
     page.tiles.get(c.uav).map.dirty = true;
   });
   for (const uav of page.tiles.keys()) if (!page.crafts.has(uav)) page.tiles.delete(uav);

@@ -3,10 +3,10 @@
 export const HOLD_MS = 1000;
 
 /**
- * Have `node` call `action` after it was held (finger, mouse, Space or Enter); `tell` explains a press that was too short.
- * With `ms` 0 it acts at once.
+ * Have `node` call `action` after it was held (finger, mouse, Space or Enter); `tell(false)` explains a press that was too short.
+ * With `ms` 0 it acts at once. `aim()` is what the press is for: where that is another at its end, `tell(true)` and no action.
  */
-export function onHold(node, action, tell, ms = HOLD_MS) {
+export function onHold(node, action, tell, ms = HOLD_MS, aim = () => null) {
   let timer = null;
   const blocked = () => node.getAttribute("aria-disabled") === "true";
   const begin = () => {
@@ -15,10 +15,15 @@ export function onHold(node, action, tell, ms = HOLD_MS) {
       action();
       return;
     }
+    const meant = aim();
     node.style.setProperty("--hold", `${ms}ms`);
     node.classList.add("held");
     timer = setTimeout(() => {
       stop();
+      if (aim() !== meant) {
+        tell?.(true);
+        return;
+      }
       navigator.vibrate?.(60);
       action();
     }, ms);
@@ -31,7 +36,7 @@ export function onHold(node, action, tell, ms = HOLD_MS) {
   const end = () => {
     if (timer === null) return;
     stop();
-    tell?.();
+    tell?.(false);
   };
   node.addEventListener("pointerdown", (event) => {
     if (event.button !== 0) return;

@@ -77,9 +77,11 @@ class Page {
   onState(message) {
     const now = performance.now(), names = new Set(message.aircraft.map((view) => view.uav));
     for (const view of message.aircraft) this.craftOf(view.uav).take(view, now);
-    for (const uav of this.crafts.keys()) if (!names.has(uav)) this.crafts.delete(uav);
-    if (this.craft && !this.crafts.has(this.craft.uav)) this.craft = null;
-    if (!this.craft && names.size) this.choose([...names][0]);
+    for (const craft of this.crafts.values()) {
+      craft.heard = names.has(craft.uav);
+      // the one that is shown stays: in its place another would take the orders that are meant for it
+      if (!craft.heard && craft !== this.craft) this.crafts.delete(craft.uav);
+    }
     this.operators = message.operators;
     this.fleet = message.fleet;
     this.map.dirty = true;
@@ -161,7 +163,7 @@ class Page {
   /** Who else is there; to each of them command of this aircraft can be handed. */
   drawOthers() {
     const others = (this.operators ?? []).filter((o) => o.n !== this.me?.n), uav = this.craft?.uav;
-    const mine = this.craft?.view?.commander?.n === this.me?.n;
+    const mine = this.craft?.heard && this.craft.view?.commander?.n === this.me?.n;
     $("others").replaceChildren(...others.map((o) => {
       const node = el("button", { type: "button", class: "mini" }, el("span", {}, mine ? `Hand command of ${uav} to ${o.name}` : `${o.name} is here`));
       set(node, "aria-disabled", mine ? null : "true");
@@ -222,7 +224,7 @@ class Page {
   treeActions(tree) {
     const about = el("p"), node = el("button", { class: "mini", id: "choose" }, el("span", {}, "Fly to this tree"));
     const more = el("div", { class: "tree-more" }, about, node);
-    onHold(node, () => this.orders.press(CHOOSE, more.tree.id), () => this.toast("info", "Keep it pressed for one second."));
+    this.orders.onHold(node, "it", () => this.orders.press(CHOOSE, more.tree.id));
     more.refresh = (t, kind) => {
       more.tree = t;
       text(about, `⌀ ${(t.radius * 200).toFixed(1)} ± ${(t.sigmaRadius * 200).toFixed(1)} cm, seen ${t.observations} times, ${Math.round((t.arc * 180) / Math.PI)}° of its bark. At x ${t.x.toFixed(2)}, y ${t.y.toFixed(2)} m.`);
@@ -278,7 +280,7 @@ class Page {
   drawWords() {
     const now = performance.now(), craft = this.craft;
     this.map.inset = this.phone.matches ? { top: 0, bottom: 0, right: 60 } : { top: Math.min($("mission").offsetHeight + 8, innerHeight * 0.25), bottom: 44, right: 0 };
-    this.cloud.look(this.grid || document.hidden ? null : craft?.uav ?? null);
+    this.cloud.look(this.grid || document.hidden || !craft?.heard ? null : craft.uav);
     drawFleet(this, now);
     if (this.grid) drawTiles(this, now);
     drawMission(craft, now, this.grid);

@@ -12,6 +12,7 @@ export class Craft {
     this.uav = uav;
     this.view = null;
     this.at = -Infinity;
+    this.heard = true; // the station knows of it; a new one may not yet
     this.trees = [];
     this.treesVersion = -1;
     this.treesMap = "";
@@ -73,10 +74,16 @@ export class Craft {
 
   /** Return good, late, lost or none: the worse of what the station says and what our own clock says. */
   link(now) {
+    if (!this.heard) return "lost";
     const age = this.linkAge(now);
     if (age === null) return "none";
     if (age > 1.5) return "lost";
     return this.view.link === "lost" ? "late" : this.view.link;
+  }
+
+  /** Why nothing new of it is shown. */
+  get silence() {
+    return this.heard ? "link lost" : "not heard";
   }
 
   /** Return what kind of tree this is on map and list. */

@@ -24,15 +24,21 @@ export class OrderBar {
     this.nodes = new Map();
     for (const order of ORDERS) {
       const node = el("button", { class: "order", id: `order-${order.name}`, "data-kind": order.kind, "aria-disabled": "true" }, el("span", {}, order.label), el("small", {}, order.hint));
-      onHold(node, () => this.press(order), () => page.toast("info", `Keep ${order.label} pressed for one second.`), order.ms);
+      this.onHold(node, order.label, () => this.press(order), order.ms);
       this.nodes.set(order.name, node);
       $("buttons").append(node);
     }
     this.take = el("button", { class: "mini", id: "take" }, el("span", {}, "Take command"));
-    onHold(this.take, () => this.changeCommand(), () => page.toast("info", "Keep it pressed for one second."));
+    this.onHold(this.take, "it", () => this.changeCommand());
     this.name = el("b", { id: "who-uav" });
     this.words = el("div", { id: "who-words" });
     $("who").append(el("div", {}, this.name, this.words), this.take);
+  }
+
+  /** Have `node`, held, act on the aircraft that is shown; on none where another was chosen since the press began. */
+  onHold(node, label, action, ms = HOLD_MS) {
+    const tell = (other) => this.page.toast("info", other ? "Another aircraft was chosen: nothing was sent." : `Keep ${label} pressed for one second.`);
+    onHold(node, action, tell, ms, () => this.page.craft?.uav);
   }
 
   /** Return why an order makes no sense now; it can be sent all the same only when this is empty. */
@@ -40,6 +46,7 @@ export class OrderBar {
     const { craft, link } = this.page;
     if (!link.up) return "the station is out of reach";
     if (!craft?.view) return "no aircraft is heard";
+    if (!craft.heard) return `${craft.uav} is not heard`;
     const commander = craft.view.commander;
     if (order.name !== "hold" && commander && commander.n !== this.page.me?.n) return `${commander.name} is in command: take command first`;
     const now = performance.now(), age = craft.age(craft.view.mission?.age, now);
@@ -72,7 +79,7 @@ export class OrderBar {
 
   async changeCommand() {
     const { craft, link, me } = this.page;
-    if (!craft?.view) return;
+    if (!craft?.view || !craft.heard) return;
     const mine = craft.view.commander?.n === me?.n;
     const reply = await link.ask({ t: mine ? "release" : "take", uav: craft.uav });
     this.page.toast(reply.accepted ? "good" : "bad", reply.reason);
@@ -82,11 +89,11 @@ export class OrderBar {
     const { craft, me } = this.page;
     for (const order of ORDERS) set(this.nodes.get(order.name), "aria-disabled", this.why(order) ? "true" : null);
     text(this.name, craft ? craft.uav : "no aircraft");
-    const commander = craft?.view?.commander;
+    const commander = craft?.heard ? craft.view?.commander : null;
     const mine = commander && commander.n === me?.n;
-    text(this.words, !craft ? "" : mine ? "you are in command" : commander ? `${commander.name} is in command` : "nobody is in command");
+    text(this.words, !craft ? "" : !craft.heard ? "not heard: no order reaches it" : mine ? "you are in command" : commander ? `${commander.name} is in command` : "nobody is in command");
     text(this.take.firstChild, mine ? "Give back" : "Take command");
-    set(this.take, "hidden", craft ? null : "");
+    set(this.take, "hidden", craft?.heard ? null : "");
   }
 }
 

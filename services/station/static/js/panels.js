@@ -96,7 +96,8 @@ export function drawLog(events, uav, several) {
     panel.replaceChildren(el("p", { class: "empty", "data-key": "empty" }, "Nothing has happened yet."));
     return;
   }
-  keyed(panel, mine, (e) => e.number, (e) => el("div", { class: "event", "data-level": e.level }, el("time", {}, clock(e.time_ns)), el("p", {}, several && e.uav ? el("b", {}, `${e.uav} `) : null, e.text)), () => {});
+  // a restarted station numbers from 1 again
+  keyed(panel, mine, (e) => `${e.number}/${e.time_ns}`, (e) => el("div", { class: "event", "data-level": e.level }, el("time", {}, clock(e.time_ns)), el("p", {}, several && e.uav ? el("b", {}, `${e.uav} `) : null, e.text)), () => {});
 }
 
 // -- systems
@@ -104,9 +105,9 @@ export function drawLog(events, uav, several) {
 /** Who holds what, by the arbiter's book. */
 function fleetRows({ leases, visited, waits }) {
   const rows = [{ key: "g3", group: `Claims of the fleet: ${visited} trees visited${waits ? `, none granted for ${duration(waits)}` : ""}` }];
-  for (const { uav, kind, tree, left } of leases) {
+  for (const { id, uav, kind, tree, left } of leases) {
     const what = kind === "tree" ? `tree ${tree}` : kind === "way" ? "way home" : "its place";
-    rows.push({ key: `c/${uav}/${what}`, name: uav, level: left < 15 ? "late" : "good", right: what, note: `${Math.round(left)} s left` });
+    rows.push({ key: `c/${uav}/${id}`, name: uav, level: left < 15 ? "late" : "good", right: what, note: `${Math.round(left)} s left` });
   }
   return rows;
 }
