@@ -5,3 +5,5 @@ from __future__ import annotations
 from typing import Literal
 
 CommandName = Literal["start", "hold", "resume", "abort", "land", "choose", "next"]
+STOPS: frozenset[CommandName] = frozenset({"hold", "land", "abort"})
+"""Orders that make safe: never too late, overtaken by none, sent to every navigator that answers."""

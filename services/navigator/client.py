@@ -6,7 +6,7 @@ from typing import Protocol, TypeVar
 
 from schemas.codec import Wire
 from schemas.command import Command, CommandReply, NonceReply, NonceRequest
-from schemas.orders import CommandName
+from schemas.orders import STOPS, CommandName
 from schemas.topics import COMMAND, COMMAND_NONCE, Topic
 
 A = TypeVar("A", bound=Wire)
@@ -22,10 +22,6 @@ class Asker(Protocol):
         ...
 
 
-_TO_ALL = frozenset({"hold", "abort", "land"})
-"""Orders that make safe: where two navigators run by mistake, both get them."""
-
-
 def send_command(
     asker: Asker, name: CommandName, tree_id: int | None = None, sender: str = "operator", timeout_s: float = 2.0
 ) -> CommandReply | None:
@@ -35,7 +31,7 @@ def send_command(
     of them, and of each: else one would carry out what another one's answer calls refused.
     """
     nonces = asker.ask(COMMAND_NONCE, NonceRequest(sender=sender), NonceReply, timeout_s)
-    if len(nonces) > 1 and name not in _TO_ALL:
+    if len(nonces) > 1 and name not in STOPS:
         reason = f"{len(nonces)} navigators of this aircraft answer: stop all but one; treedock doctor shows more"
         return CommandReply(accepted=False, reason=reason, state="unknown")
     replies: list[CommandReply] = []

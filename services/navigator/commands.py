@@ -11,11 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from schemas.command import Command, NonceReply
-from schemas.orders import CommandName
+from schemas.orders import STOPS
 
 _MAX_NONCES = 64
 _PER_SENDER = 4
-_STOPS: frozenset[CommandName] = frozenset({"hold", "land", "abort"})
 
 
 @dataclass
@@ -57,11 +56,11 @@ class CommandDesk:
             return f"the nonce was given to another sender, not to {command.sender}"
         if command.sequence < entry.next_sequence:
             return f"replayed: sequence {command.sequence}, expected {entry.next_sequence} or more"
-        if command.name not in _STOPS and command.sequence <= self._stopped_at:
+        if command.name not in STOPS and command.sequence <= self._stopped_at:
             return f"overtaken: {command.name} was on its way when a hold, land or abort was carried out; say it again"
         entry.next_sequence = command.sequence + 1
         self._sequence = max(self._sequence, command.sequence)
-        if command.name in _STOPS:
+        if command.name in STOPS:
             self._stopped_at = max(self._stopped_at, command.sequence)
         return ""
 

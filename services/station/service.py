@@ -23,6 +23,7 @@ import zenoh
 from schemas.command import CommandReply
 from schemas.envelope import Message
 from schemas.health import Health
+from schemas.orders import STOPS
 from schemas.preview import PreviewImage
 from schemas.topics import (
     FLEET_HELD,
@@ -61,8 +62,6 @@ _TOKEN_RING = 1_024
 _TREES_RING = 8  # 1.6 s of an aircraft that tells five times a second
 _ORDERS_AT_ONCE = 8
 _NOT_ABOARD = frozenset({"router", "recorder"})
-_NEVER_TOO_LATE = frozenset({"hold", "land", "abort"})
-"""Orders that make safe: whatever has happened since they were given, they are meant."""
 _TOPICS: dict[Topic, Callable[[Aircraft, Any], object]] = {
     SLAM_POSE: Aircraft.on_pose, MISSION_STATE: Aircraft.on_mission, VEHICLE_STATE: Aircraft.on_vehicle,
     TREES_TARGET: Aircraft.on_target, HEALTH: Aircraft.on_health, FLEET_HELD: Aircraft.on_held, FUSION_STATE: Aircraft.on_fusion,
@@ -230,7 +229,7 @@ class Station:
         def ask() -> None:
             reply: CommandReply | None = None
             waited_s = time.monotonic() - given_s
-            if waited_s > self.config.view_stale_s and order.name not in _NEVER_TOO_LATE:
+            if waited_s > self.config.view_stale_s and order.name not in STOPS:
                 reason = f"it waited {waited_s:.1f} s in the station behind other orders: look, and press again"
                 reply = CommandReply(accepted=False, reason=reason, state="unknown")
             else:
