@@ -73,6 +73,13 @@ def test_a_mission_that_the_bridge_ended_while_the_navigator_hung_is_well() -> N
     assert list(faults_of("navigator", ended, Limits())) == []
 
 
+def test_a_landing_that_went_on_without_the_navigator_is_well() -> None:
+    landed = replace(GOOD, state="landing", end="idle", reason="waiting for a start command", bridge_landed="")
+    assert list(faults_of("navigator", landed, Limits())) == []
+    assert list(faults_of("navigator", replace(landed, armed_after=True), Limits())) != []
+    assert list(faults_of("navigator", replace(landed, state="approach"), Limits())) != []
+
+
 def test_the_worst_of_several_counts() -> None:
     several = [GOOD, replace(GOOD, held_s=0.5, back_s=None), replace(GOOD, state="landing", held_s=9.0)]
     assert summary(several)["held_s"] == 0.5

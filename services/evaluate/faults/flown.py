@@ -87,6 +87,11 @@ class Flown:
         return self.states[-1].state if self.states else ""
 
     @property
+    def mission_id(self) -> int:
+        """The mission's number, 0 before the first."""
+        return self.states[-1].mission_id if self.states else 0
+
+    @property
     def vehicle(self) -> VehicleState | None:
         """The vehicle, as told last."""
         return self.vehicles[-1] if self.vehicles else None

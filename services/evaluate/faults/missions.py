@@ -96,12 +96,14 @@ class Flights:
         if not rig.until(lambda: rig.all_ready and self._stands, _READY_WITHIN_S):
             vehicle = flown.vehicle
             raise InputError(f"no aircraft ready to start: {vehicle.note if vehicle else 'no word of the vehicle'}")
+        number = flown.mission_id
         for _ in range(90):
             reply = self._order_start()
             if reply is not None and reply.accepted:
                 self.starts += 1
                 self._started_ns = flown.now_ns
-                rig.until(lambda: flown.state not in {*ENDED, "idle"}, 10.0)
+                # what is heard next may still be of the mission before
+                rig.until(lambda: flown.mission_id != number and flown.state not in {*ENDED, "idle"}, 10.0)
                 return
             rig.pump(0.5)
         raise InputError(f"the start stays refused: {reply.reason if reply else 'nobody answers'}")

@@ -53,7 +53,9 @@ def common(seen: Seen) -> Iterator[str]:
         yield f"the mission ended ({seen.end}) without a reason"
     if seen.end in ENDED and seen.armed_after:
         yield f"the mission ended ({seen.end}) with the aircraft armed"
-    ended_by_bridge = seen.end == "idle" and (seen.bridge_landed or not seen.flew) and not seen.armed_after
+    # the bridge lands by itself, or goes on with the landing that was ordered: a navigator that comes back finds nothing to do
+    landed = bool(seen.bridge_landed) or seen.state == "landing" or not seen.flew
+    ended_by_bridge = seen.end == "idle" and landed and not seen.armed_after
     if seen.end not in ENDED and seen.end not in _MOVING | {"landing"} and not ended_by_bridge:
         yield f"the mission neither went on nor ended: {seen.end or 'no word'}, {seen.reason}"
 
