@@ -60,7 +60,8 @@ LOG = logging.getLogger(__name__)
 _REQUEST_RING = 512
 _TOKEN_RING = 1_024
 _TREES_RING = 8  # 1.6 s of an aircraft that tells five times a second
-_ORDERS_AT_ONCE = 8
+_ORDERS_AT_ONCE, _STOPS_AT_ONCE = 8, 16
+"""An order to an aircraft that does not answer takes some seconds: one that makes safe waits behind no other."""
 _NOT_ABOARD = frozenset({"router", "recorder"})
 _TOPICS: dict[Topic, Callable[[Aircraft, Any], object]] = {
     SLAM_POSE: Aircraft.on_pose, MISSION_STATE: Aircraft.on_mission, VEHICLE_STATE: Aircraft.on_vehicle,
@@ -80,7 +81,8 @@ class Station:
         self._waiting: set[tuple[str, str]] = set()
         """Aircraft and service of tokens that came before anything else of that aircraft."""
         self._reporter = HealthReporter("station", context.health)
-        self._pool = ThreadPoolExecutor(_ORDERS_AT_ONCE, thread_name_prefix="order")
+        self._orders = ThreadPoolExecutor(_ORDERS_AT_ONCE, thread_name_prefix="order")
+        self._stops = ThreadPoolExecutor(_STOPS_AT_ONCE, thread_name_prefix="stop")
         token = self._token()
         self.site = Site(self.config, Guard(token, local=self.config.local), Ears(self.call, lambda: self.brain))
         self.brain = Brain(self.config, self.site, self._send_order, time.time_ns)
@@ -239,7 +241,7 @@ class Station:
                     LOG.warning("order %s to %s failed: %s", order.name, order.uav, error)
             self.call(lambda: self.brain.on_answer(order, reply))
 
-        self._pool.submit(ask)
+        (self._stops if order.name in STOPS else self._orders).submit(ask)
 
     # -- once a second, and the end
 
@@ -264,7 +266,8 @@ class Station:
         self.keeping.close()
         self._server.stop()
         self.clouds.close()
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        for pool in (self._orders, self._stops):
+            pool.shutdown(wait=False, cancel_futures=True)
 
 
 def build(context: LiveContext) -> Station:

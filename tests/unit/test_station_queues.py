@@ -123,7 +123,8 @@ def made() -> Iterator[Callable[..., Ground]]:
             bus.clouds.release(100)
             bus.orders.set()
         ground.station._server._socket.close()
-        ground.station._pool.shutdown(wait=False, cancel_futures=True)
+        ground.station._orders.shutdown(wait=False, cancel_futures=True)
+        ground.station._stops.shutdown(wait=False, cancel_futures=True)
         ground.station.clouds.close()
 
 
@@ -142,11 +143,11 @@ def test_an_order_that_waited_is_refused_unless_it_makes_safe(made: Callable[...
     slow, other = ground.aircraft("uav1"), ground.aircraft("uav2")
     slow.orders.clear()
     for _ in range(8):
-        ground.order("uav1", "hold")
+        ground.order("uav1", "next")
     for name in ("start", "hold", "land", "abort"):
         ground.order("uav2", name)
-    time.sleep(0.4)
-    assert not other.asked
+    assert ground.until(lambda: len(ground.answers) == 3), "what makes safe waits behind no other"
+    assert ground.until(lambda: False, 0.4) is False
     slow.orders.set()
     assert ground.until(lambda: len(ground.answers) == 12)
     assert {name for name in other.asked if name != COMMAND_NONCE.name} == {"hold", "land", "abort"}
