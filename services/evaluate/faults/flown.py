@@ -89,7 +89,7 @@ class Flown:
     @property
     def mission_id(self) -> int:
         """The mission's number, 0 before the first."""
-        return self.states[-1].mission_id if self.states else 0
+        return self.guidance[-1].mission_id if self.guidance else 0
 
     @property
     def vehicle(self) -> VehicleState | None:
