@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
@@ -21,6 +22,11 @@ from services.security.transport import router_settings
 
 LOG = logging.getLogger(__name__)
 
+_RUNTIME, _READERS = "ZENOH_RUNTIME", "(rx: (worker_threads: 32))"
+"""Zenoh closes a connection with a linger of 10 s, and whoever closes one that is stuck waits for so long. A machine that is
+out of reach leaves as many as it has services: with Zenoh's two threads of its own all others stood still for 10 s, 10 s after
+a cable was pulled (its issue 1101; measured in tests/process/test_router_stuck.py)."""
+
 
 @contextmanager
 def listening(config: TreedockConfig) -> Iterator[zenoh.Session]:
@@ -29,6 +35,7 @@ def listening(config: TreedockConfig) -> Iterator[zenoh.Session]:
     Raises:
         InputError: the port is taken, the address is not this machine's, or a certificate is missing.
     """
+    os.environ.setdefault(_RUNTIME, _READERS)  # read when the first session is opened
     endpoint = config.router.listen_endpoint
     secured = router_settings(config.security, config.uav) | memory_settings(config)
     protocol, host, port = split_endpoint(endpoint)
