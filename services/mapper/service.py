@@ -38,6 +38,8 @@ _LOOK_S = 1.0
 _INDEX_S = 5.0
 """Without any change the index is still told so often, for those who missed the last one."""
 _HOLD_S = 3.0
+_FARTHEST_M = 5_000.0
+"""From the map's origin: no aircraft was there, and the ground between would need a terabyte."""
 """So long keyframes that the saved map knows wait for the graph that tells whether it is slam's map still."""
 
 
@@ -86,6 +88,8 @@ class MapperService:
     def on_keyframe(self, keyframe: Keyframe) -> None:
         """Take up a keyframe, unless it is known or its images are damaged."""
         self._follow_map(keyframe.map_id)
+        if self._astray((keyframe.T_map_camera,)):
+            return
         if self._may_be_saved(keyframe):
             self._held_since_ns = self._held_since_ns if self._held_back else self._context.clock.now_ns()
             self._held_back.append(keyframe)
@@ -115,7 +119,7 @@ class MapperService:
     def on_graph(self, graph: Graph) -> None:
         """Move the submaps to where the graph now puts their keyframes; an older graph is ignored."""
         self._follow_map(graph.map_id)
-        if graph.version < self._graph_version:
+        if graph.version < self._graph_version or self._astray(node.T_map_camera for node in graph.nodes):
             return
         self._unsaved |= graph.version > self._graph_version  # a saved map of an older graph may be another slam's
         self._graph_version = graph.version
@@ -206,6 +210,18 @@ class MapperService:
         }
         self._nodes = nodes
         return poses
+
+    def _astray(self, poses: Iterable[Transform]) -> bool:
+        """Whether slam tells places where nobody can have been: left out, counted and told."""
+        worst_m = max((abs(v) for pose in poses for v in pose.position_m), default=0.0)
+        if worst_m <= _FARTHEST_M:
+            self._context.health.note("slam", "")
+            return False
+        self._context.health.count("poses_astray")
+        self._context.health.note(
+            "slam", f"a keyframe {worst_m / 1000.0:.0f} km from the start: slam is astray; restart it"
+        )
+        return True
 
     def _follow_map(self, map_id: str) -> None:
         if map_id == self.map.map_id:

@@ -124,6 +124,20 @@ def test_a_keyframe_that_was_culled_before_it_came_is_not_mapped_at_its_old_plac
     assert [submap.submap_id for submap in system.send(late)] == [3], "its graph comes after it"
 
 
+def test_a_slam_that_is_astray_by_kilometres_ends_no_mapper() -> None:
+    system = _Listener()
+    system.send(_keyframe(1, AHEAD))
+    far = level_camera([70_000.0, 0.0, 1.5], 0.0)
+    assert system.send(_graph(2, {1: far})) == []
+    assert system.send(_keyframe(2, far)) == []
+    health = system.mapper._context.health
+    assert health.counters["poses_astray"] == 2
+    assert "70 km" in health.notes["slam"]
+    assert system.mapper.map.submaps[1].T_map_submap == pytest.approx(AHEAD)
+    system.send(_graph(3, {1: AHEAD}))
+    assert "slam" not in health.notes
+
+
 def test_a_new_map_withdraws_the_old() -> None:
     system = _Listener()
     system.send(_keyframe(1, AHEAD))
