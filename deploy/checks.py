@@ -110,12 +110,8 @@ def elsewhere(config: Path, folder: Path) -> str:
         places = {name: station.get(table, {}).get(key, "") for name, (table, key) in keys.items()}
         kept = [name for name in keys if (folder / name).exists()]
         left = [name for name in kept if Path(places[name]).name == name and not Path(places[name]).exists()]
-    except (
-        OSError,
-        ValueError,
-        AttributeError,
-    ):  # not there yet in a dry run; what is wrong with it `treedock config` says
-        return ""
+    except (OSError, ValueError, AttributeError):
+        return ""  # not there yet in a dry run; what is wrong with it `treedock config` says
     unnamed = [f'\n      {".".join(keys[name])} = "{folder / name}"' for name in kept if not places[name]]
     if unnamed:
         do = f"add to {config}:\n      [station]{''.join(unnamed)}"

@@ -121,7 +121,8 @@ class Replay:
         if self._next is None and not self._fetch():
             return
         assert self._next is not None
-        if self._source.paced and self._due_ns(self._next.stamp_ns) > self._service.context.clock.now_ns():
+        waits = self._source.paced and isinstance(self._next, RgbdFrame)  # a bad frame's stamp says nothing
+        if waits and self._due_ns(self._next.stamp_ns) > self._service.context.clock.now_ns():
             return
         item, self._next = self._next, None
         if isinstance(item, BadFrame):
@@ -169,11 +170,15 @@ class Replay:
             self._done = True
             self._service.context.health.count("source_done")
             return False
-        stamp_ns = self._next.stamp_ns
-        if self._first_ns is None or stamp_ns - self._before_ns > JUMP_NS:  # a pause in a recording is not waited out
+        if isinstance(self._next, RgbdFrame):
+            self._keep_pace(self._next.stamp_ns)
+        return True
+
+    def _keep_pace(self, stamp_ns: int) -> None:
+        """Begin to count anew at the first frame, and after a pause: that is not waited out."""
+        if self._first_ns is None or stamp_ns - self._before_ns > JUMP_NS:
             self._first_ns, self._begun_ns = stamp_ns, self._service.context.clock.now_ns()
         self._before_ns = stamp_ns
-        return True
 
     def _due_ns(self, stamp_ns: int) -> int:
         """Return when a frame is due on our clock: recorded intervals, divided by the rate."""

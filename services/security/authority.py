@@ -163,11 +163,8 @@ class Authority:
         make_folder(folder, 0o700)
         pairs = [f"{identity.text}{end}" for identity in identities for end in (".pem", ".key")]
         files = []
-        for name in (
-            CA_CERTIFICATE,
-            *pairs,
-            Register.FILE,
-        ):  # a router may look here: first the pairs, then who has rights
+        # the list last: a router may look here, and takes up rights as soon as it changes
+        for name in (CA_CERTIFICATE, *pairs, Register.FILE):
             try:
                 body = (self.folder / name).read_bytes()
             except OSError as error:

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,6 +15,8 @@ from services.camera import service
 from services.camera.codecs import decode_depth_raw
 from services.camera.config import CameraConfig
 from services.camera.depth.config import DepthConfig
+from services.camera.sources import ConditionedSource
+from services.camera.sources.base import Source
 from services.common.clock import SimulatedClock
 from services.common.config import TreedockConfig
 from services.common.context import Context
@@ -118,6 +122,31 @@ def test_a_bad_recorded_frame_is_skipped_and_the_replay_goes_on(tmp_path: Path) 
     assert [f.seq for f in rig.frames] == [0, 2, 3]
     assert rig.counters["dropped_bad_frame"] == 1
     assert "no such file" in rig.context.health.notes["frame"]
+
+
+@pytest.mark.parametrize("stray_at", [0, 3])
+def test_a_stray_stamp_and_a_pause_leave_the_pace_as_it_is(stray_at: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A wrong stamp far ahead made the rest come all at once; a pause of an hour would be waited out."""
+    good = [START_NS + k * PERIOD_NS for k in range(10)]
+    good += [good[-1] + 3_600_000_000_000 + k * PERIOD_NS for k in range(10)]
+    stamps = [*good[:stray_at], good[-1] + 10**15, *good[stray_at:]]
+
+    class Stamped:
+        name, paced, expected, remark = "stamped", True, None, ""
+
+        def __iter__(self) -> Iterator[RgbdFrame]:
+            return iter([frame(k, stamp_ns) for k, stamp_ns in enumerate(stamps)])
+
+    config = CameraConfig(source="tum:made up", depth=RANGE_ONLY)
+    monkeypatch.setattr(service, "open_source", lambda *_: ConditionedSource(cast("Source", Stamped()), config))
+    rig = Rig(config)
+    sent = []
+    for k in range(1, 60):
+        rig.hub.advance_to(START_NS + k * PERIOD_NS // 2)
+        sent.append(len(rig.frames))
+    assert rig.counters["dropped_bad_frame"] == 1
+    assert sent[-1] == 20
+    assert max(b - a for a, b in itertools.pairwise(sent)) <= 2
 
 
 def test_a_source_that_cannot_be_opened_stops_the_service(tmp_path: Path) -> None:
