@@ -37,9 +37,9 @@ Matrix = NDArray[np.float64]
 _LOOK_S = 1.0
 _INDEX_S = 5.0
 """Without any change the index is still told so often, for those who missed the last one."""
-_HOLD_S = 3.0
 _FARTHEST_M = 5_000.0
 """From the map's origin: no aircraft was there, and the ground between would need a terabyte."""
+_HOLD_S = 3.0
 """So long keyframes that the saved map knows wait for the graph that tells whether it is slam's map still."""
 
 

@@ -28,8 +28,9 @@ _WHOLE_NS = 5_000_000_000
 _BEAT_NS = 5_000_000_000
 _AGAIN, _AGAIN_NS = 3, 60_000_000_000
 _VERSIONS_LOST = 1000
+_KEYFRAMES_LOST = 100
 _RESETS_LOST = 16
-"""More graphs and jumps than can have been told after the last that was written."""
+"""More graphs, keyframes and jumps than can have been told after the last that was written."""
 
 
 def since_boot_ns() -> int:
@@ -192,7 +193,7 @@ def _restore(log: Log, whole: Arrays, slam: Slam) -> str:
         _insert(slam, keyframe)
     if placed + len(later) == 0:
         return "nothing sound is left of the map on disk"
-    slam.atlas.next_serial(max(newest, *by_serial) + 1)
+    slam.atlas.next_serial(max(newest, *by_serial) + 1 + _KEYFRAMES_LOST)
     version = max(version, *(k.graph_version for k in keyframes))
     sigma = float(whole["up_sigma_rad"]) if whole else slam.up_sigma_rad
     assert log.header is not None

@@ -170,6 +170,17 @@ def test_a_killed_slam_goes_on_in_its_map_before_it_gives_a_pose(tmp_path: Path)
     assert min(new) > max(old.keyframe_poses()), "an old keyframe's number never names a new one"
 
 
+def test_a_keyframe_that_was_told_but_not_written_lends_its_number_to_no_other(tmp_path: Path) -> None:
+    told = max(kept_map(tmp_path).keyframe_poses())
+    (tmp_path / "map.npz").unlink()
+    log = tmp_path / "keyframes.log"
+    kept = [record(kind, body) for kind, body in records(log.read_bytes())]
+    log.write_bytes(b"".join(kept[:-1]))  # killed between the message and the disk
+    slam, _ = taken_up(tmp_path)
+    turn = [slam.track(10**12 + k, *look(T)) for k, T in enumerate(turn_on_the_spot(32, 140.0))]
+    assert min(n.keyframe_id for r in turn for n in r.new_keyframes) > told, "the mapper has that one's points"
+
+
 def test_without_the_whole_map_the_keyframes_alone_do(tmp_path: Path) -> None:
     kept_map(tmp_path)
     (tmp_path / "map.npz").unlink()
