@@ -19,6 +19,7 @@ from services.slam.far import FarPrior
 from services.slam.features import Features
 from services.slam.links import create_points, points_of, shared_counts
 from services.slam.refine import gate
+from services.slam.runaway import ran_away, span_m
 from services.slam.thinning import Thinning
 from services.slam.tidy import cull_recent, describe_all, drop_outliers, fuse
 from services.slam.worker import Crew
@@ -31,6 +32,9 @@ _COMPILED_KEYFRAMES = 24
 _TRIES = 3
 """Of a large adjustment that keyframes cut short: each goes on where the last one stopped. On a walk keyframes never cease, and trying
 for ever took half a core (6,000 frames: 1.28 cores); when the camera rests it is done in any case."""
+
+_MISFIT = 25.0
+"""Five standard deviations' limits: observations beyond are forgotten where an adjustment ran away."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +66,8 @@ class Mapping:
         self.revision = 0
         """Up by one whenever poses of keyframes were corrected."""
         self.why: GraphReason = "local_ba"
+        self.refused = 0
+        """Adjustments that ran away and were not taken over."""
         self.owed = 0
         """Tries that a large adjustment has left that was put off or cut short."""
         self.turns = 0
@@ -198,6 +204,8 @@ class Mapping:
         counts[window] = 0
         order = np.lexsort((kf.serial, -counts))
         fixed = order[counts[order] > 0][:most_fixed].astype(np.int32)
+        if not len(fixed):  # nobody outside sees any of it: one of its own holds it where it is
+            window, fixed = window[:-1], window[-1:]
         return self._part(ids, window, fixed)
 
     def _part(self, ids: I32, free: I32, fixed: I32) -> Part | None:
@@ -208,7 +216,7 @@ class Mapping:
         slots = np.concatenate([free, fixed]).astype(np.int32)
         index = np.full(len(kf.n), -1, np.int32)
         index[slots] = np.arange(len(slots))
-        far = self.far.disparity(self.camera.array[4], _span_m(kf.R[slots], kf.t[slots]))
+        far = self.far.disparity(self.camera.array[4], span_m(kf.R[slots], kf.t[slots]))
         problem = build(points, kf, ids, slots, index, self.camera.variance, far)
         return Part(problem, ids, slots, len(free), self.turned)
 
@@ -217,6 +225,7 @@ class Mapping:
         if part is None:
             return
         problem, camera = part.problem, self.camera.array
+        stood = problem.R.copy(), problem.t.copy(), problem.X.copy()
         for rounds, robust in ((robust_iterations, True), (iterations, False)):
             if part.free <= _COMPILED_KEYFRAMES:
                 adjust(problem, camera, part.free, rounds, robust)
@@ -229,11 +238,24 @@ class Mapping:
             gate(chi_squares(problem, camera), problem.info, 1.0, problem.use)
         if part.free > _COMPILED_KEYFRAMES:
             give_back_memory()
+        if not np.isfinite(problem.X).all() or ran_away(stood[:2], (problem.R, problem.t)):
+            self._refuse(part, *stood)
+            return
         with self.step():
             measured = self.atlas.points.parallax[part.ids] < 0.0
             self.depth_noise.learn(disparity_residuals(problem, camera, self.depth_noise.least_info, measured))
             self._apply(part)
             self.why = why
+
+    def _refuse(self, part: Part, R: F64, t: F64, X: F64) -> None:
+        """Leave the map as it stands after an adjustment that ran away, but forget what does not fit it by far: that led it astray."""
+        problem = part.problem
+        problem.R[:], problem.t[:], problem.X[:] = R, t, X
+        gate(chi_squares(problem, self.camera.array), problem.info, _MISFIT, problem.use)
+        with self.step():
+            points, kf = self.atlas.points, self.atlas.keyframes
+            drop_outliers(points, kf, part.ids, part.slots, problem.start, problem.pose, problem.use)
+        self.refused += 1
 
     def keyframe_pose(self, serial: int) -> F64:
         """Return T_map_keyframe (4, 4) of a keyframe that lives, or lived.
@@ -266,9 +288,3 @@ class Mapping:
     def turn_since(self, before: F64) -> F64 | None:
         """Return what takes map points of when ``turned`` was ``before`` to now's, (3, 3); None when the map stands."""
         return None if self.turned is before else self.turned @ before.T
-
-
-def _span_m(R: F64, t: F64) -> float:
-    """Return how far apart cameras (C, 3, 3), (C, 3) stand: the diagonal of the box round their centres."""
-    centre = -np.einsum("cba,cb->ca", R, t)
-    return float(np.linalg.norm(np.ptp(centre, axis=0)))

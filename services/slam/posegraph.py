@@ -25,6 +25,10 @@ _DENSE_NODES = 60
 _SIGMA_M = 0.01
 _SIGMA_RAD = 0.004
 """Of one edge, before its weight."""
+_SHARES = (1.0, 0.5, 0.125, 0.01)
+"""Of a step, tried until one does not raise the cost: far from the optimum a whole step may lead anywhere."""
+_CONVERGED = 1e-6
+"""Share of the cost."""
 
 
 class Edges(NamedTuple):
@@ -140,15 +144,23 @@ def expect_nodes(nodes: int) -> None:
 
 
 def optimise(R: F64, t: F64, edges: Edges, free: NDArray[np.bool_], iterations: int = 10) -> float:
-    """Move the free poses ``R`` (N, 3, 3), ``t`` (N, 3) in place to agree with the edges; return the final cost."""
+    """Move the free poses ``R`` (N, 3, 3), ``t`` (N, 3) in place to agree with the edges; return the final cost, never above the first."""
     blocks, g = np.zeros((len(edges.i), 4, 6, 6)), np.zeros((len(R), 6))
     cost = linearise(R, t, edges, blocks, g)
     for _ in range(iterations):
         step = solve_normal(edges, blocks, g, free)
-        for k in np.flatnonzero(free):
-            step_pose(R[k], t[k], step[k])
-        new = linearise(R, t, edges, blocks, g)
-        if abs(cost - new) <= 1e-6 * max(cost, 1e-12):
+        stood = R.copy(), t.copy()
+        for share in _SHARES:
+            R[:], t[:] = stood
+            for k in np.flatnonzero(free):
+                step_pose(R[k], t[k], share * step[k])
+            new = linearise(R, t, edges, blocks, g)
+            if new - cost <= _CONVERGED * max(cost, 1e-12):
+                break
+        else:
+            R[:], t[:] = stood
+            return cost
+        if abs(cost - new) <= _CONVERGED * max(cost, 1e-12):
             return new
         cost = new
     return cost

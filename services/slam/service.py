@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 
 import numpy as np
@@ -22,6 +23,8 @@ from services.slam.messages import Nodes, pose_message
 from services.slam.results import GraphUpdate, TrackResult
 from services.slam.slam import Slam
 from services.slam.warm import warm, warm_beside
+
+LOG = logging.getLogger(__name__)
 
 _JPEG_QUALITY = 80
 _ATTITUDE_AGE_NS = 200_000_000
@@ -69,6 +72,8 @@ class SlamService:
         self._last_stamp_ns = -1
         self._idle_periods = 0
         self._polished = True
+        self._refused = 0
+        """Adjustments of the present map."""
         self.keyframes_ns: tuple[int, ...] = ()
         """Stamps of the keyframes of a flight whose recording comes: they are followed."""
 
@@ -101,9 +106,18 @@ class SlamService:
         if result.status in {"lost", "relocalising"}:
             health.count("lost_frames")
         self._publish(frame, result)
+        self._count_refused(slam)
         while slam.settled_ms:
             health.stage_ms["map"].append(slam.settled_ms.popleft())
         self.slam = self._maps.after(slam, result)
+
+    def _count_refused(self, slam: Slam) -> None:
+        """Count the adjustments that ran away and were not taken over."""
+        new = slam.mapping.refused - self._refused
+        if new > 0:
+            self._context.health.count("adjustments_refused", new)
+            LOG.warning("%s: an adjustment of the map ran away; it was not taken over", slam.map_id)
+        self._refused = slam.mapping.refused
 
     def on_idle(self) -> None:
         """Tell what mapping has done since the last frame; polish when none comes (a recording's end, a pause).
