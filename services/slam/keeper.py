@@ -149,7 +149,7 @@ def whole_map(slam: Slam) -> Arrays:
         "n": points.n[ids], "frame": kf.serial[frame], "feature": feature,
         "numbers": np.array([slam.era, slam.graph_version, slam.reset_counter, since_boot_ns(),
                              slam.atlas.newest_serial]),
-        "up_sigma_rad": np.array(slam.up_sigma_rad),
+        "up_sigma_rad": np.array(slam.up_sigma_rad), "map_id": np.array(slam.map_id),
     }  # fmt: skip
 
 
@@ -160,7 +160,7 @@ def take_up(store: Store, slam: Slam, max_age_s: float) -> str:
     """
     try:
         log = store.read()
-        return _unfit(log, slam, max_age_s) or _restore(log, store.read_map(), slam)
+        return _unfit(log, slam, max_age_s) or _restore(log, _of_the_same_map(log, store.read_map()), slam)
     except (ValueError, LookupError, TypeError, struct.error, zipfile.BadZipFile) as error:
         return f"the map on disk cannot be read ({error})"
 
@@ -180,6 +180,12 @@ def _unfit(log: Log, slam: Slam, max_age_s: float) -> str:
     if sum(now_ns - taken_ns < _AGAIN_NS for taken_ns in log.taken_ns) >= _AGAIN:
         return f"the map on disk was taken up {_AGAIN} times within a minute: it may be what ends slam"
     return ""
+
+
+def _of_the_same_map(log: Log, whole: Arrays) -> Arrays:
+    """Return the whole map if it is the log's: one that was being written while another map was begun lies beside its log."""
+    assert log.header is not None
+    return whole if whole and str(whole["map_id"]) == log.header.map_id else {}
 
 
 def _restore(log: Log, whole: Arrays, slam: Slam) -> str:

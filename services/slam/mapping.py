@@ -19,7 +19,7 @@ from services.slam.far import FarPrior
 from services.slam.features import Features
 from services.slam.links import create_points, points_of, shared_counts
 from services.slam.refine import gate
-from services.slam.runaway import ran_away, span_m
+from services.slam.runaway import moved_m, ran_away, span_m
 from services.slam.thinning import Thinning
 from services.slam.tidy import cull_recent, describe_all, drop_outliers, fuse
 from services.slam.worker import Crew
@@ -67,7 +67,8 @@ class Mapping:
         """Up by one whenever poses of keyframes were corrected."""
         self.why: GraphReason = "local_ba"
         self.refused = 0
-        """Adjustments that ran away and were not taken over."""
+        """Adjustments that ran away and were not taken over; and in words, the last one."""
+        self.refused_last = ""
         self.owed = 0
         """Tries that a large adjustment has left that was put off or cut short."""
         self.turns = 0
@@ -250,6 +251,10 @@ class Mapping:
     def _refuse(self, part: Part, R: F64, t: F64, X: F64) -> None:
         """Leave the map as it stands after an adjustment that ran away, but forget what does not fit it by far: that led it astray."""
         problem = part.problem
+        self.refused_last = (
+            f"of {part.free} keyframes one went {moved_m((R, t), (problem.R, problem.t)):.0f} m, {len(part.slots) - part.free} held, "
+            f"{len(problem.pose)} observations of {len(X)} points"
+        )
         problem.R[:], problem.t[:], problem.X[:] = R, t, X
         gate(chi_squares(problem, self.camera.array), problem.info, _MISFIT, problem.use)
         with self.step():

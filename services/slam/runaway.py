@@ -26,9 +26,13 @@ def span_m(R: F64, t: F64) -> float:
     return float(np.linalg.norm(np.ptp(centres(R, t), axis=0)))
 
 
+def moved_m(before: tuple[F64, F64], after: tuple[F64, F64]) -> float:
+    """Return how far the camera that moved farthest went; infinite when one is nowhere."""
+    if not all(np.isfinite(a).all() for a in after):
+        return np.inf
+    return float(np.linalg.norm(centres(*after) - centres(*before), axis=1).max(initial=0.0))
+
+
 def ran_away(before: tuple[F64, F64], after: tuple[F64, F64]) -> bool:
     """Return whether cameras (C, 3, 3), (C, 3) moved farther than a correction can move them, or to nowhere."""
-    if not all(np.isfinite(a).all() for a in after):
-        return True
-    moved_m = np.linalg.norm(centres(*after) - centres(*before), axis=1)
-    return bool(moved_m.max(initial=0.0) > max(_LEAST_M, _SHARE * span_m(*before)))
+    return moved_m(before, after) > max(_LEAST_M, _SHARE * span_m(*before))

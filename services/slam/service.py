@@ -116,7 +116,11 @@ class SlamService:
         new = slam.mapping.refused - self._refused
         if new > 0:
             self._context.health.count("adjustments_refused", new)
-            LOG.warning("%s: an adjustment of the map ran away; it was not taken over", slam.map_id)
+            LOG.warning(
+                "%s: an adjustment of the map ran away and was not taken over: %s",
+                slam.map_id,
+                slam.mapping.refused_last,
+            )
         self._refused = slam.mapping.refused
 
     def on_idle(self) -> None:

@@ -49,6 +49,8 @@ def test_an_adjustment_that_ran_away_is_not_taken_over(what: str, monkeypatch: p
     monkeypatch.setattr("services.slam.mapping.adjust", astray)
     slam.mapping.adjust_all()
     assert slam.mapping.refused == 1
+    words = {"a keyframe": "one went 173205 m", "a point": "one went 0 m", "no number": "one went inf m"}
+    assert words[what] in slam.mapping.refused_last
     assert slam.mapping.revision == revision, "nothing new is told"
     for serial, T in slam.keyframe_poses().items():
         np.testing.assert_array_equal(T, before[serial])

@@ -227,6 +227,19 @@ def test_a_map_that_ends_slam_again_and_again_is_left(tmp_path: Path) -> None:
     assert "3 times" in whys[3]
 
 
+def test_a_whole_map_beside_another_maps_log_is_left(tmp_path: Path) -> None:
+    old = kept_map(tmp_path)
+    store = Store(tmp_path, MOST)
+    foreign = store.read_map() | {"map_id": np.array("map-before")}
+    foreign["t"] = foreign["t"] + 70.0
+    store.write_map(foreign)
+    slam, why_not = taken_up(tmp_path)
+    assert not why_not
+    truth = old.keyframe_poses()
+    for serial, T in slam.keyframe_poses().items():
+        np.testing.assert_allclose(T[:3, 3], truth.get(serial, T)[:3, 3], atol=0.05)
+
+
 def test_a_whole_map_of_another_version_is_refused_not_fatal(tmp_path: Path) -> None:
     kept_map(tmp_path, 3)
     Store(tmp_path, MOST).write_map({"numbers": np.arange(2)})
