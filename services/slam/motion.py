@@ -13,6 +13,8 @@ F64 = NDArray[np.float64]
 
 _KEEPS_S = 0.35
 """A velocity is worth something for so long."""
+_LEAST_S = 0.008
+"""Frames nearer in time tell no velocity: a centimetre of noise in a millisecond is 10 m/s, and stamps made on arrival bunch."""
 _ACCELERATION_M_S2 = 15.0
 _ANGULAR_ACCELERATION_RAD_S2 = 60.0
 _SLACK_M = 0.04
@@ -64,7 +66,7 @@ class Motion:
         dt_s = self.since_s(stamp_ns)
         if dt_s > _KEEPS_S:
             return STILL
-        if T_last_camera is None or dt_s <= 0.0:
+        if T_last_camera is None or dt_s < _LEAST_S:
             return Velocity(self._v_m_s, self._w_rad_s)
         v_m_s, w_rad_s = T_last_camera[:3, 3] / dt_s, log_rotation(T_last_camera[:3, :3]) / dt_s
         if not self._sure:
@@ -79,7 +81,7 @@ class Motion:
 
     def plausible(self, stamp_ns: int, T_last_camera: F64) -> bool:
         """Return whether the camera can have moved so since the last frame."""
-        dt_s = self.since_s(stamp_ns)
+        dt_s = max(self.since_s(stamp_ns), self._step_s)  # stamps may bunch: frames were still taken one after another
         if not can_have_moved(dt_s, T_last_camera):
             return False
         if not self._sure or dt_s > _KEEPS_S:
@@ -96,7 +98,7 @@ class Motion:
         dt_s = self.since_s(stamp_ns)
         if T_last_camera is None or not 0.0 < dt_s <= _KEEPS_S:
             self.forget()
-        else:
+        elif dt_s >= _LEAST_S:
             self._v_m_s = T_last_camera[:3, 3] / dt_s
             self._w_rad_s = log_rotation(T_last_camera[:3, :3]) / dt_s
             self._sure, self._step_s = True, dt_s

@@ -14,6 +14,10 @@ from services.slam.verify import Verifier
 
 F64 = NDArray[np.float64]
 
+_SIGMA_MOST_M = 0.5
+"""A place known worse is none: where hardly anything near is seen the far points tell the direction alone, and the less the
+farther away the place is said to be, the more they agree with it."""
+
 
 class Relocation:
     """Finds frames blind; in doubt one is not believed before a second was found where the camera can be by then."""
@@ -27,7 +31,7 @@ class Relocation:
     def find(self, stamp_ns: int, features: Features, depth_m: NDArray[np.float32]) -> Tracked | None:
         """Return the frame located anywhere in the map, None when it is not, or not believed yet; ``depth_m`` (H, W)."""
         frame = self._loops.relocate(features)
-        if frame is None or not self._verifier.believes(frame, depth_m, blind=True):
+        if frame is None or not self._known(frame) or not self._verifier.believes(frame, depth_m, blind=True):
             self._found = None
             return None
         before, self._found = self._found, (stamp_ns, frame)
@@ -36,6 +40,18 @@ class Relocation:
             return None
         self._found = None
         return frame
+
+    @staticmethod
+    def _known(frame: Tracked) -> bool:
+        return position_sigma_m(frame) <= _SIGMA_MOST_M
+
+
+def position_sigma_m(frame: Tracked) -> float:
+    """Return the standard deviation of where the camera is, in its worst direction; infinite where nothing tells it."""
+    if frame.information is None or not np.isfinite(frame.information).all():
+        return np.inf
+    covariance = np.linalg.inv(frame.information + 1e-9 * np.eye(6))
+    return float(np.sqrt(max(np.linalg.eigvalsh(covariance[:3, :3])[-1], 0.0)))
 
 
 def step_between(last: Tracked, frame: Tracked) -> F64:

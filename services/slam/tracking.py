@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from services.slam.atlas import Atlas, neighbours
 from services.slam.binary import match_all
+from services.slam.blind import ransac
 from services.slam.camera import CameraModel
 from services.slam.config import SlamConfig
 from services.slam.far import FarPrior
@@ -191,24 +192,20 @@ class Tracking:
         self, features: Features, world: F64, match: I32, known: I32, last: Tracked | None = None
     ) -> Tracked | None:
         """Locate a frame without any prior from 3D-2D matches (query -> feature): AP3P in RANSAC, then refinement."""
-        import cv2
-
         queries = np.flatnonzero(match >= 0)
-        if len(queries) < 10:
-            return None
-        c = self.camera.array
-        K = np.array([[c[0], 0.0, c[2]], [0.0, c[1], c[3]], [0.0, 0.0, 1.0]])
-        cv2.setRNGSeed(1)
-        ok, r, t, inliers = cv2.solvePnPRansac(
-            np.ascontiguousarray(world[queries]), np.ascontiguousarray(features.uv[match[queries]]), K, None,
-            iterationsCount=300, reprojectionError=4.0, confidence=0.9999, flags=cv2.SOLVEPNP_AP3P,
-        )  # fmt: skip
-        if not ok or len(inliers) < 10:
-            return None
-        R, _ = cv2.Rodrigues(r)
-        kept = np.full_like(match, -1)
-        kept[queries[inliers[:, 0]]] = match[queries[inliers[:, 0]]]
-        return self._locate(features, np.ascontiguousarray(R), np.ascontiguousarray(t[:, 0]), world, kept, known, last)
+        measured = queries[self._measured(known[queries])]
+        for chosen in (measured, queries):  # far ones only where there are too few others
+            found = ransac(world[chosen], features.uv[match[chosen]], self.camera.array)
+            if found is not None:
+                R, t, agree = found
+                kept = np.full_like(match, -1)
+                kept[chosen[agree]] = match[chosen[agree]]
+                return self._locate(features, R, t, world, kept, known, last)
+        return None
+
+    def _measured(self, known: I32) -> Bool:
+        """Return which of map points ``known`` (-1: temporary, taken as measured) have measured depth."""
+        return (known < 0) | (self.atlas.points.parallax[known] < 0.0)
 
     def again(self, frame: Tracked) -> None:
         """Refine a frame's pose by the points it sees, in place, after its features were moved."""
