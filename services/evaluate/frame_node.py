@@ -21,14 +21,15 @@ from services.common.runtime import run_service
 class Sender:
     """Sends one and the same picture at a rate, stamped as it goes."""
 
-    def __init__(self, context: Context, width: int, height: int, rate_hz: float) -> None:
-        self._context = context
+    def __init__(self, context: Context, out: Path, width: int, height: int, rate_hz: float) -> None:
+        self._context, self._out = context, out
         self._camera = Intrinsics(
             width=width, height=height, fx=float(width), fy=float(width), cx=width / 2.0, cy=height / 2.0
         )
         self._colour, self._depth = bytes(3 * width * height), bytes(2 * width * height)
         self._seq = 0
         context.every(1.0 / rate_hz, self.tick)
+        context.on_stop(self.write)
 
     def tick(self) -> None:
         """Send one."""
@@ -38,19 +39,23 @@ class Sender:
         ))  # fmt: skip
         self._seq += 1
 
+    def write(self) -> None:
+        """Keep how many were sent."""
+        self._out.write_text(json.dumps(self._seq), encoding="utf-8")
+
 
 class Listener:
-    """Notes how old each frame is when it comes to its handler."""
+    """Notes how old each frame is when it comes to its handler, by its number."""
 
     def __init__(self, context: Context, out: Path) -> None:
-        self._ages_ms: list[float] = []
+        self._ages_ms: dict[int, float] = {}
         self._out = out
         context.on(CAMERA_RGBD, self.on_frame)
         context.on_stop(self.write)
 
     def on_frame(self, frame: RgbdFrame) -> None:
         """Note one."""
-        self._ages_ms.append((time.time_ns() - frame.stamp_ns) * 1e-6)
+        self._ages_ms[frame.seq] = (time.time_ns() - frame.stamp_ns) * 1e-6
 
     def write(self) -> None:
         """Keep what was seen."""
@@ -64,7 +69,7 @@ def main() -> int:
 
     def build(context: Context) -> object:
         if role == "camera":
-            return Sender(context, int(width), int(height), float(rate_hz))
+            return Sender(context, Path(out), int(width), int(height), float(rate_hz))
         return Listener(context, Path(out))
 
     return run_service(role, build, load_config(Path(config)))

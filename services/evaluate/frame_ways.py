@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +21,8 @@ LISTENERS = ("slam", "refiner", "preview")
 RATE_HZ = 30.0
 _MEASURE_S, _QUICK_S = 10.0, 3.0
 _SETTLE_S = 1.0
+_DRAIN_S = 0.3
+"""For what is on its way when the camera ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +38,7 @@ class Way:
     """Of one listener, their mean."""
     router_cores: float
     lost: int
-    """Frames that a listener did not get, of all three."""
+    """Frames sent, once all had found each other, that a listener did not get; of all three."""
 
     @property
     def cores(self) -> float:
@@ -76,26 +78,38 @@ def measure(*, shared: bool, size: tuple[int, int], seconds: float) -> Way:
                 meter = Meter({role: running.pid(role) for role in ("router", "camera", *LISTENERS)})
                 time.sleep(seconds)
                 used = meter.read()
-                for role in ("camera", *LISTENERS):
+                running.stop("camera")
+                time.sleep(_DRAIN_S)
+                for role in LISTENERS:
                     running.stop(role)
-        ages = [json.loads(_out(folder, role).read_text(encoding="utf-8")) for role in LISTENERS]
-    return _way(ages, {role: usage.cpu_cores for role, usage in used.items()}, shared=shared)
+        ages = [
+            {int(seq): age for seq, age in json.loads(_out(folder, role).read_text(encoding="utf-8")).items()}
+            for role in LISTENERS
+        ]
+        sent = int(json.loads(_out(folder, "camera").read_text(encoding="utf-8")))
+    return way_of(ages, sent, {role: usage.cpu_cores for role, usage in used.items()}, shared=shared)
 
 
 def _out(folder: Path, role: str) -> Path:
     return folder / f"{role}.ages.json"
 
 
-def _way(ages_ms: Sequence[Sequence[float]], cores: dict[str, float], *, shared: bool) -> Way:
+def way_of(ages_ms: Sequence[Mapping[int, float]], sent: int, cores: Mapping[str, float], *, shared: bool) -> Way:
+    """Return what listeners saw: the age of each frame by its number, of ``sent`` frames.
+
+    Raises:
+        InputError: a listener got none.
+    """
     counts = [len(ages) for ages in ages_ms]
     if not all(counts):
         raise InputError(f"frames came to {sum(n > 0 for n in counts)} of {len(counts)} listeners only")
-    together = np.concatenate([np.array(ages) for ages in ages_ms])
+    together = np.concatenate([np.array(list(ages.values())) for ages in ages_ms])
+    wanted = range(round(_SETTLE_S * RATE_HZ), sent)
     p50, p99 = np.quantile(together, [0.5, 0.99])
     return Way(
         shared, round(float(p50), 2), round(float(p99), 2), round(cores["camera"], 3),
         round(float(np.mean([cores[role] for role in LISTENERS])), 3), round(cores["router"], 3),
-        sum(max(counts) - n for n in counts),
+        sum(seq not in ages for ages in ages_ms for seq in wanted),
     )  # fmt: skip
 
 

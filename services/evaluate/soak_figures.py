@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-WARM_SHARE = 0.25
-"""The first part of a run, in which caches fill, is left out of slopes."""
+WARM_SHARE, WARM_S = 0.25, 600.0
+"""The first part of a run, in which caches fill, is left out of slopes: a quarter, and ten minutes at least."""
+LEAST_S = 1200.0
+"""A shorter run says nothing of memory's slope."""
 LATE_SHARE = 2.0 / 3.0
 """From here on it is looked at whether what rose has levelled off."""
 _BLOCKS = 12
@@ -82,7 +84,7 @@ def of_service(samples: Sequence[Sample]) -> dict[str, float]:
     Begin and end are medians over a tenth of the run, so that a file that is open for a moment counts for nothing.
     """
     end_s = samples[-1].at_s
-    late = [s for s in samples if s.at_s >= WARM_SHARE * end_s] or list(samples)
+    late = [s for s in samples if s.at_s >= max(WARM_SHARE * end_s, WARM_S)] or list(samples)
     tenth = max(1, len(late) // 10)
     first, last = late[:tenth], late[-tenth:]
     line = slope(*_memory(late))
@@ -96,7 +98,7 @@ def of_service(samples: Sequence[Sample]) -> dict[str, float]:
         "threads_more": float(np.median([s.threads for s in last]) - np.median([s.threads for s in first])),
         "files": float(np.median([s.files for s in last])),
         "files_more": float(np.median([s.files for s in last]) - np.median([s.files for s in first])),
-        "restarts": float(len({s.pid for s in samples}) - 1),
+        "restarts": float(len({s.pid for s in samples}) - 1), "long_enough": float(end_s >= LEAST_S),
     }  # fmt: skip
 
 
@@ -115,7 +117,8 @@ def faults_of(figures: Mapping[str, float]) -> list[str]:
     """Return in words what grows: memory by more than a hundredth of itself an hour, threads, files; and restarts."""
     found = []
     if (
-        figures["mb_per_h"] > max(1.0, 0.01 * figures["rss_mb"])
+        figures["long_enough"]
+        and figures["mb_per_h"] > max(1.0, 0.01 * figures["rss_mb"])
         and figures["mb_per_h"] > 3.0 * figures["mb_per_h_error"]
     ):
         found.append(f"memory rises by {figures['mb_per_h']:.1f} MB/h")

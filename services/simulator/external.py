@@ -15,10 +15,10 @@ from schemas.topics import SIM_RGBD, SIM_TRUTH
 from services.common.context import Context
 from services.common.errors import InputError
 from services.common.geometry import Matrix, pose, rotation_z
+from services.common.mount import Mount
 from services.simulator.config import SimulatorConfig
 from services.simulator.px4.frames import FLIP, rotation_from_wxyz
 from services.simulator.px4.geodesy import to_local
-from services.simulator.px4.pose_source import body_camera
 from services.simulator.relay import Endpoint
 from services.simulator.stage import Stage
 
@@ -95,7 +95,9 @@ class ExternalFlight:
         self.stage = Stage(config)
         scene, legs_m = self.stage.scene, config.px4.airframe.leg_height_m
         start = pose(rotation_z(scene.start_yaw_rad), (0.0, 0.0, scene.ground.at(0.0, 0.0) + legs_m))
-        self._T_body_camera = body_camera(context.config.autopilot.camera_offset_m)
+        autopilot = context.config.autopilot
+        mount = Mount.level(autopilot.camera_offset_m, autopilot.camera_pitch_rad, autopilot.camera_yaw_rad)
+        self._T_body_camera = mount.T_body_camera
         self.stage.begin_map(start @ self._T_body_camera)
         self._track = TruthTrack(start)
         self._parser = m.MAVLink(None)

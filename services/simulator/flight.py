@@ -82,7 +82,9 @@ class Flight:
         if px4 is None:
             self.px4.open_links()
             context.on_stop(self.px4.close)
-        self.camera = FlyingCamera(self.px4, context.config.autopilot.camera_offset_m)
+        autopilot = context.config.autopilot
+        first = Mount.level(autopilot.camera_offset_m, autopilot.camera_pitch_rad, autopilot.camera_yaw_rad)
+        self.camera = FlyingCamera(self.px4, first)
         self._T_body_second = Mount.level(second.offset_m, second.pitch_rad, second.yaw_rad).T_body_camera
         self.stage.begin_map(self.camera.pose())
         seen = Follower("slam", ("camera",)), Follower("refiner", ("camera", "slam"))

@@ -12,7 +12,7 @@ import pytest
 
 from services.common.errors import InputError
 from services.evaluate.bench_system import BUDGETS, ONBOARD, RATE_HZ
-from services.evaluate.frame_ways import measure
+from services.evaluate.frame_ways import measure, way_of
 from services.evaluate.live_set import fly, read_frames
 from services.evaluate.passages import Passage, Passages, figures_of, late_line, latencies_ms, stages_ms
 from services.evaluate.usage import Budget, Usage, over_budget
@@ -44,6 +44,14 @@ def test_stages_add_up_to_the_latency() -> None:
     assert figures["latency_ms_max"] == pytest.approx(93.0)
     assert figures["measured"] == 50
     assert np.sum([np.array(ms) for ms in stages_ms(seen).values()], axis=0) == pytest.approx(latencies_ms(seen))
+
+
+def test_frames_that_reached_nobody_are_lost_too() -> None:
+    cores = {"camera": 0.1, "router": 0.1, "slam": 0.1, "refiner": 0.1, "preview": 0.1}
+    got = {seq: 2.0 for seq in range(300) if seq not in (3, 50, 51)}  # 3: before all had found each other
+    assert way_of([got, got, {**got, 50: 2.0}], 300, cores, shared=False).lost == 5
+    with pytest.raises(InputError, match="1 of 3"):
+        way_of([got, {}, {}], 300, cores, shared=True)
 
 
 def test_late_frames_are_told_with_their_second_and_the_first_second_apart() -> None:

@@ -8,8 +8,11 @@ from pathlib import Path
 import pytest
 
 from schemas.health import Health
+from schemas.trees import TreeList
+from services.evaluate.faults.chain import lost
 from services.evaluate.faults.chain_rows import unsaid
 from services.evaluate.faults.missions import Seen, line_of
+from services.evaluate.faults.rig import Comeback
 from services.evaluate.faults.verdict import Limits, common, faults_of, hold_within_s, summary
 from tests.examples import all_messages
 
@@ -49,6 +52,50 @@ def test_whatever_does_not_hold_is_named(change: dict[str, object], word: str) -
     found = list(faults_of("slam", replace(GOOD, **change), Limits()))  # type: ignore[arg-type]
     assert len(found) == 1
     assert word in found[0]
+
+
+FLOWN_ON = replace(GOOD, state="scan", held_s=None, end="approach", reason="on")
+
+
+@pytest.mark.parametrize("service", ["mapper", "detector", "recorder", "preview", "station", "second_slam", "router"])
+def test_a_mission_that_does_not_need_the_service_goes_on(service: str) -> None:
+    assert list(faults_of(service, FLOWN_ON, Limits())) == []
+    docked = replace(FLOWN_ON, end="landed", reason="docked and back", docked=True)
+    assert list(faults_of(service, docked, Limits())) == []
+    assert list(faults_of(service, replace(FLOWN_ON, state="return", end="landed", reason="done"), Limits())) == []
+
+
+def test_a_mission_that_ends_for_want_of_what_it_does_not_need_is_complained_of() -> None:
+    ended = replace(FLOWN_ON, end="landed", reason="no way")
+    held = replace(ended, holds=("detector is dead or hung",))
+    assert "does not need recorder" in next(faults_of("recorder", held, Limits()))
+    assert "never held before" in next(faults_of("detector", ended, Limits()))
+    assert list(faults_of("detector", held, Limits())) == [], "away for long it holds, and lands"
+    assert list(faults_of("refiner", replace(held, state="scan"), Limits())) == []
+
+
+def test_a_loaded_machine_is_forgiven_what_it_made_wait_and_no_more() -> None:
+    assert Comeback("slam", 0.0, 3.0, 1.0).ready_after_s() == 3.0
+    assert Comeback("slam", 0.0, 9.0, 1.0, waited_s=6.0).ready_after_s() == 3.0
+    assert Comeback("slam", 0.0, 9.0, 1.0, waited_s=0.5).ready_after_s() == 8.5, (
+        "it slept, and nobody kept it from working"
+    )
+    assert Comeback("slam", 0.0, 9.0, 2.0, waited_s=30.0).ready_after_s() == 2.5, (
+        "threads wait at once: never less than its own work"
+    )
+
+
+def test_a_tree_elsewhere_under_its_id_or_in_another_map_is_lost() -> None:
+    before = all_messages()["treedock.trees"]
+    assert isinstance(before, TreeList)
+    assert before.trees
+    assert lost(before, before) == []
+    moved = before.trees[0].model_copy(update={"x_m": before.trees[0].x_m + 0.1})
+    assert lost(before, before.model_copy(update={"trees": (moved, *before.trees[1:])})) == [before.trees[0].id]
+    other = before.model_copy(update={"map_id": "another"})
+    assert lost(before, other) == [t.id for t in before.trees]
+    assert lost(before, other, anew=True) == []
+    assert lost(before, other.model_copy(update={"trees": ()}), anew=True) == [t.id for t in before.trees]
 
 
 def test_what_each_loss_asks_of_the_flight() -> None:

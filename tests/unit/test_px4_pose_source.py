@@ -6,14 +6,17 @@ import numpy as np
 import pytest
 
 from services.common.geometry import camera_yaw, pose, rotation_z
+from services.common.mount import Mount
 from services.simulator.px4.config import Px4Config
 from services.simulator.px4.pose_source import SLICE_S, FlyingCamera
 from services.simulator.px4.simulated import SimulatedPx4
 
 
-def standing(yaw_rad: float = 0.5, offset_m: tuple[float, float, float] = (0.05, 0.0, -0.02)) -> FlyingCamera:
+def standing(
+    yaw_rad: float = 0.5, offset_m: tuple[float, float, float] = (0.05, 0.0, -0.02), pitch_rad: float = 0.0
+) -> FlyingCamera:
     px4 = SimulatedPx4(lambda _x, _y: 0.3, pose(rotation_z(yaw_rad), [1.0, 2.0, 0.4]), Px4Config(), 1)
-    return FlyingCamera(px4, offset_m)
+    return FlyingCamera(px4, Mount.level(offset_m, pitch_rad))
 
 
 def test_camera_looks_forward_from_its_place_on_the_body() -> None:
@@ -21,6 +24,12 @@ def test_camera_looks_forward_from_its_place_on_the_body() -> None:
     T = c.pose()
     assert camera_yaw(T) == pytest.approx(0.5)
     assert np.allclose(T[:3, 3], rotation_z(0.5) @ [0.05, 0.0, -0.02] + [1.0, 2.0, 0.4])
+
+
+def test_a_camera_that_is_mounted_looking_down_looks_down() -> None:
+    forward = standing(pitch_rad=0.3).pose()[:3, 2]
+    assert forward[2] == pytest.approx(-np.sin(0.3))
+    assert np.arctan2(forward[1], forward[0]) == pytest.approx(0.5)
 
 
 def test_standing_it_neither_moves_nor_accelerates_nor_ends() -> None:

@@ -10,9 +10,9 @@ import pytest
 from pymavlink.dialects.v20 import common as m
 
 from services.common.geometry import Matrix, camera_yaw, pose, rotation_z
+from services.common.mount import Mount
 from services.simulator.external import TruthTrack
 from services.simulator.px4.config import Px4Config
-from services.simulator.px4.pose_source import body_camera
 from services.simulator.px4.simulated import SimulatedPx4
 from services.simulator.px4.telemetry import hil_state_quaternion
 from services.simulator.relay import OUR_COMPONENT, Endpoint, Relay, split
@@ -129,7 +129,7 @@ def test_other_addresses_are_refused() -> None:
 
 
 def camera_of(T_world_body: Matrix) -> Matrix:
-    return T_world_body @ body_camera((0.0, 0.0, 0.0))
+    return T_world_body @ Mount.level((0.0, 0.0, 0.0)).T_body_camera
 
 
 def test_the_told_pose_begins_at_the_scenes_start_whatever_px4s_own_is() -> None:

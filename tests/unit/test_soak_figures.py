@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from services.evaluate.bench_soak import _speeds
 from services.evaluate.soak_figures import Sample, SharedFiles, faults_of, of_service, slope, steady
 
 
@@ -25,6 +27,19 @@ def test_a_flat_memory_is_called_flat_although_it_filled_at_first() -> None:
     figures = of_service(samples(0.0))
     assert abs(figures["mb_per_h"]) < 0.5
     assert faults_of(figures) == []
+
+
+@pytest.mark.parametrize("minutes", [1, 3, 10, 19, 20, 30])
+def test_caches_that_fill_are_no_leak_however_short_the_run(minutes: int) -> None:
+    assert faults_of(of_service([s for s in samples(0.0) if s.at_s <= 60.0 * minutes])) == []
+
+
+def test_the_speed_of_simulated_time_tells_what_gets_slower() -> None:
+    rows: list[dict[str, Any]] = [{"at_s": 10.0 * k, "sim_s": 10.0 * k - 0.01 * k * k} for k in range(100)]
+    slower = _speeds(rows)
+    assert slower["speed"] == pytest.approx(0.9, abs=0.01)
+    assert slower["speed_last_over_first"] < 0.9
+    assert _speeds([{"at_s": 10.0 * k, "sim_s": 0.0} for k in range(5)]) == {}, "nothing is simulated"
 
 
 def test_a_leak_is_found_with_its_size() -> None:

@@ -18,8 +18,9 @@ from typing import Self
 import numpy as np
 
 from schemas.camera import RgbdFrame
+from schemas.mapping import MapIndex
 from schemas.slam import Pose
-from schemas.topics import SIM_RGBD, SLAM_POSE
+from schemas.topics import MAP_INDEX, SIM_RGBD, SLAM_POSE
 from schemas.trees import TreeList
 from services.common.errors import InputError
 from services.common.session import free_port
@@ -32,7 +33,8 @@ _RATE_HZ = 15.0
 _SAME_M = 0.05
 _READY_WITHIN_S = 300.0
 _SEEN_WITHIN_S = 90.0
-_STAYS_S = 4.0
+_MOST_SUBMAPS = 0.9
+_STAYS_S = 6.0
 """Longer than the mapper takes to tell what it holds, twice, and the detector to draw its conclusions."""
 
 
@@ -43,6 +45,9 @@ class Chain:
     rig: Rig
     frames: Sequence[RgbdFrame]
     poses: list[Pose] = field(default_factory=list)
+    index: MapIndex | None = None
+    """What the mapper holds, as told last; and when that was heard."""
+    index_heard_s: float = 0.0
 
     @classmethod
     def over_a_recording(cls, seed: int | None, folder: Path, tell: Callable[[str], None]) -> Chain:
@@ -60,7 +65,17 @@ class Chain:
         self._there_and_back: Iterator[RgbdFrame] = itertools.cycle([*self.frames, *reversed(self.frames)])
         self._seq, self._due_s = 0, time.monotonic()
         self.rig.__enter__()
+        try:
+            self._begin()
+        except BaseException:  # nobody has it yet who would end it
+            self.rig.__exit__()
+            raise
+        return self
+
+    def _begin(self) -> None:
+        """Wait until all are ready, and until the recording has shown its trees."""
         self.rig.bus.subscribe(SLAM_POSE, self._on_pose)
+        self.rig.bus.subscribe(MAP_INDEX, self._on_index)
         if not self.rig.until(lambda: self.rig.all_ready, _READY_WITHIN_S):
             raise InputError(f"not ready within {_READY_WITHIN_S:.0f} s: see {self.rig.folder}")
         self.rig.each = self._feed
@@ -68,7 +83,6 @@ class Chain:
         self.rig.pump(2.0 * len(self.frames) / _RATE_HZ + 5.0)  # once there and back: all trees are known
         if not self.rig.until(lambda: self.trees is not None, _SEEN_WITHIN_S):
             raise InputError("the recording shows no tree: another --seed")
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.rig.__exit__()
@@ -86,6 +100,14 @@ class Chain:
     def _on_pose(self, pose: Pose) -> None:
         self.poses.append(pose)
         del self.poses[:-2000]
+
+    def _on_index(self, index: MapIndex) -> None:
+        self.index, self.index_heard_s = index, time.monotonic()
+
+    @property
+    def submaps(self) -> int:
+        """Return how many submaps the mapper holds."""
+        return len(self.index.submap_ids) if self.index is not None else 0
 
     @property
     def trees(self) -> TreeList | None:
@@ -118,35 +140,47 @@ class Chain:
             raise InputError(f"no tree in the list for {_SEEN_WITHIN_S:.0f} s: see {self.rig.folder}")
         return found
 
-    def whole_again(self, before: TreeList, since_ns: int) -> list[str]:
+    def whole_again(self, before: TreeList, since_ns: int, *, submaps: int = 0, anew: bool = False) -> list[str]:
         """Wait until poses come and every tree known before is known again, and stays; return what is missing.
 
-        A list of the poses' own map, and still so after some seconds: the last one stands until somebody says otherwise.
+        A list of the poses' own map, and still so after some seconds: the last one stands until somebody says otherwise. So the mapper
+        must have told by then that it holds ``submaps`` (nearly: some are thinned). ``anew``: it may be another map.
         """
         self.poses.clear()
-        end_s = time.monotonic() + _SEEN_WITHIN_S
+        asked_s = time.monotonic()
+        end_s = asked_s + _SEEN_WITHIN_S
         missing = [tree.id for tree in before.trees]
+        least = int(_MOST_SUBMAPS * submaps)
+
+        def mapped() -> bool:
+            return self.index_heard_s > asked_s and self.submaps >= least
 
         def whole() -> bool:
             nonlocal missing
             now = self.trees
             missing = (
-                lost(before, now) if now is not None and now.stamp_ns >= since_ns else [t.id for t in before.trees]
+                lost(before, now, anew=anew)
+                if now is not None and now.stamp_ns >= since_ns
+                else [t.id for t in before.trees]
             )
             ours = now is not None and bool(self.poses) and now.map_id == self.poses[-1].map_id
-            return ours and not missing and self.located_since(0) >= 15
+            return ours and not missing and self.located_since(0) >= 15 and mapped()
 
         while self.rig.until(whole, max(0.0, end_s - time.monotonic())):
             self.rig.pump(_STAYS_S)
             if whole():
                 return []
         words = [f"tree {number} is lost" for number in missing]
+        words += [f"the mapper holds {self.submaps} submaps of {submaps}"] * (not mapped())
+        words += ["slam began another map"] * (not anew and bool(self.poses) and self.poses[-1].map_id != before.map_id)
         return words + ["no pose any more"] * (self.located_since(0) < 15)
 
 
-def lost(before: TreeList, now: TreeList) -> list[int]:
-    """Return the trees of ``before`` that stand under their id within 5 cm no more; in a new map any tree may have moved."""
+def lost(before: TreeList, now: TreeList, *, anew: bool = False) -> list[int]:
+    """Return the trees of ``before`` that stand under their id within 5 cm no more; in a new map, where that may be, any may have moved."""
     if now.map_id != before.map_id:
+        if not anew:
+            return [t.id for t in before.trees]
         return [] if len(now.trees) >= len(before.trees) else [t.id for t in before.trees[len(now.trees) :]]
     places = {t.id: (t.x_m, t.y_m) for t in now.trees}
     return [

@@ -49,10 +49,10 @@ def _strike_real(bench: Bench, service: str, how: str) -> Result:
     for _ in range(bench.moments):
         chain.rig.pump(float(rng.uniform(0.5, 6.0)))
         before = chain.known()
-        since_ns = time.time_ns()
+        since_ns, submaps = time.time_ns(), chain.submaps
         back = chain.harm(service, SIGNALS[how])
         words = faults_of_comeback(back, bench.limits) + chain.whole_again(
-            before, since_ns if service == "detector" else 0
+            before, since_ns if service == "detector" else 0, submaps=submaps
         )
         failed += words
         backs.append(back.back_s if back else None)
@@ -101,7 +101,7 @@ def _strike_map(
     before, size, files = chain.known(), chain.rig.log_size(service), list[Path]()
     harm = partial(_damage_when_dead, chain.rig.folder / "state", rng, damage, service, files)
     back = chain.harm(service, before_restart=harm)
-    words = faults_of_comeback(back, limits) + chain.whole_again(before, 0)
+    words = faults_of_comeback(back, limits) + chain.whole_again(before, 0, anew=True)
 
     def silent() -> list[str]:
         return unsaid(chain.rig.said_since(service, size), chain.rig.health.get(service), files)
@@ -134,7 +134,7 @@ def _clock_step(bench: Bench) -> Result:
     chain = bench.chain()
     rig, failed, told, worst = chain.rig, list[str](), list[str](), 0.0
     for service, hours in (("slam", 1), ("slam", -2), ("router", 1)):  # slam: an hour ahead, then an hour behind
-        before = chain.known()
+        before, submaps = chain.known(), chain.submaps
         path = rig.config_file(service)
         values = json.loads(path.read_text(encoding="utf-8"))
         ahead_s = values["clock_ahead_s"] + 3600.0 * hours
@@ -145,7 +145,7 @@ def _clock_step(bench: Bench) -> Result:
         off = max((abs(v) for v in off_s.values()), default=0.0)
         worst = max(worst, off)
         failed += [f"{service}: {name} {v:+.2f} s off" for name, v in off_s.items() if abs(v) > _CLOCK_S]
-        failed += faults_of_comeback(back, bench.limits) + chain.whole_again(before, 0)
+        failed += faults_of_comeback(back, bench.limits) + chain.whole_again(before, 0, submaps=submaps)
         where = "ahead" if ahead_s > 0.0 else "behind"
         told.append(f"{service} on a clock an hour {where}: stamps within {off:.3f} s")
     bench.close()  # its clocks are no longer this machine's

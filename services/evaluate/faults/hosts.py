@@ -20,7 +20,7 @@ from services.common.errors import InputError
 
 HUB = "10.77.0.1"
 _PREFIX = "10.77.0."
-_TOOLS = ("ip", "unshare", "nsenter")
+_TOOLS = ("ip", "unshare", "nsenter", "setpriv")
 _PROBE = """
 ip link add hub type bridge
 ip link add one type veth peer name other
@@ -75,7 +75,9 @@ class Hosts:
         # frames must not pass through a memory that two machines would not share
         held = "mount -t tmpfs tmpfs /dev/shm && ip link set lo up && echo up && exec sleep infinity"
         holder = subprocess.Popen(
-            ["unshare", "--net", "--mount", "--ipc", "--", "sh", "-c", held], stdout=subprocess.PIPE, text=True
+            ["unshare", "--net", "--mount", "--ipc", "--", "setpriv", "--pdeathsig", "KILL", "sh", "-c", held],
+            stdout=subprocess.PIPE,
+            text=True,
         )
         self._holders[name] = holder
         assert holder.stdout is not None

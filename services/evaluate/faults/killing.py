@@ -8,10 +8,10 @@ from functools import partial
 
 from services.evaluate.faults.bench_rig import Bench
 from services.evaluate.faults.flown import ENDED
-from services.evaluate.faults.missions import Back, Flights, Seen, line_of
+from services.evaluate.faults.missions import NEVER_S, Back, Flights, Seen, line_of
 from services.evaluate.faults.model import Result, Row
 from services.evaluate.faults.rig import FUSED
-from services.evaluate.faults.verdict import common, faults_of, summary
+from services.evaluate.faults.verdict import common, faults_of, goes_on, summary
 
 _RESPONSE = {
     "camera": "hold at once, land after 1.2 s", "slam": "hold at once, land after 1.2 s",
@@ -24,7 +24,6 @@ _RESPONSE = {
     "router": "hold while nobody hears anybody, or fly on; the others stay alive and join again",
     "fusion": "hold at once, land after 1.2 s", "second_camera": "fly on", "second_slam": "fly on",
 }  # fmt: skip
-_AFTER_DOCKING = frozenset({"docked", "undock", "return", "landing"})
 SIGNALS = {"kill -9": signal.SIGKILL, "SIGSTOP": signal.SIGSTOP}
 
 
@@ -65,18 +64,27 @@ def _pids(children: object, but: str) -> dict[str, int]:
     return {name: c.process.pid for name, c in children.items() if c.process is not None and name != but}
 
 
-def passing(bench: Bench, row: str, harm: Callable[[Flights], Back], lands: bool) -> Result:
-    """Run a fault that passes by itself at random moments: the mission goes on, or may land where ``lands``."""
+def passing(
+    bench: Bench,
+    row: str,
+    harm: Callable[[Flights], Back],
+    lands: bool,
+    also: Callable[[Seen], list[str]] = lambda _: [],
+) -> Result:
+    """Run a fault that passes by itself at random moments: the mission goes on, or may land where ``lands``.
+
+    ``also`` returns in words what else did not hold in one of them.
+    """
     seen, failed = [], []
     for _ in range(bench.moments):
         flights = bench.flights(row)
         flights.moment()
-        docks = flights.rig.flown.docks
         one = flights.see(row, partial(harm, flights))
         seen.append(one)
-        failed += [f"{one.state}: {word}" for word in common(one)]
-        done = flights.rig.flown.docks > docks or one.state in _AFTER_DOCKING
-        if one.end in ENDED and not lands and not done:
+        failed += [f"{one.state}: {word}" for word in (*common(one), *also(one))]
+        if one.back_s is not None and one.back_s >= NEVER_S:
+            failed.append(f"{one.state}: it did not come back")
+        if one.end in ENDED and not lands and not goes_on(one):
             failed.append(f"{one.state}: the mission ended ({one.end}: {one.reason})")
     return result_of(seen, failed)
 

@@ -22,7 +22,7 @@ _GROUND_WITHIN_S = 240.0
 _SETTLE_SIM_S = 2.0
 _MOMENT_S = (1.0, 45.0)
 """Simulated seconds after the start command between which the moment is drawn: from arming to docked."""
-_NEVER_S = 1e9
+NEVER_S = 1e9
 _ROOM_M = 1.3
 """Free way to the nearest trunk that a start asks for: more than docking leaves."""
 
@@ -64,6 +64,10 @@ class Seen:
     """Whether the aircraft was armed when it struck or was armed after: one that stays on the ground has nothing to hold."""
     bridge_landed: str = ""
     """Why the bridge landed by itself, in its own words: a navigator that comes back then finds no mission to go on with."""
+    docked: bool = False
+    """Whether it docked after the fault."""
+    holds: tuple[str, ...] = ()
+    """Why the mission held after it."""
 
 
 class Back(NamedTuple):
@@ -80,7 +84,10 @@ class Flights:
     def __init__(self, rig: Rig, rng: np.random.Generator, tell: Callable[[str], None] = lambda _: None) -> None:
         self.rig, self.rng, self._tell = rig, rng, tell
         self.starts = 0
+        """Accepted start commands whose missions armed, or may still arm."""
         self._started_ns = 0
+        self._touches = 0
+        """Judged already: what is touched between two faults counts with the second."""
         self._old: Command | None = None
         """A start command that was carried out, for sending it again."""
 
@@ -165,7 +172,7 @@ class Flights:
             if service == "navigator" and back is not None:
                 self.rig.until(lambda: self.rig.flown.state == "hold", 3.0)
                 send_command(self.rig.bus, "resume", sender=_SENDER, timeout_s=1.0)
-            return Back(back.noticed_s, back.back_s, back.ready_after_s()) if back else Back(*(_NEVER_S,) * 3)
+            return Back(back.noticed_s, back.back_s, back.ready_after_s()) if back else Back(*(NEVER_S,) * 3)
 
         return self.see(f"{signal.Signals(number).name} {service}", harm)
 
@@ -173,7 +180,7 @@ class Flights:
         """Do ``harm`` now and see what comes of it; it returns when it was noticed and when the service was back."""
         flown = self.rig.flown
         before = self._moving_m_s()
-        state, at_ns, trees, touches = flown.state, flown.now_ns, self._trees(), flown.touches
+        state, at_ns, trees, docks = flown.state, flown.now_ns, self._trees(), flown.docks
         armed, armings = flown.armed, flown.armings
         back = harm()
         self._settle(at_ns)
@@ -183,10 +190,14 @@ class Flights:
             held_s=flown.held_after_s(at_ns), rest_s=flown.rest_after_s(at_ns),
             way_m=flown.way_m(at_ns, at_ns + 2_000_000_000), end=flown.state, reason=flown.reason(),
             words=tuple(dict.fromkeys(s.reason for s in flown.states if s.since_ns >= at_ns)),
-            touches=flown.touches - touches, armings=flown.armings, starts=self.starts, replays_refused=self._replay_refused(),
+            touches=flown.touches - self._touches, armings=flown.armings, starts=self.starts, replays_refused=self._replay_refused(),
             trees_lost=len(trees - self._trees()), armed_after=flown.armed,
             flew=armed or flown.armings > armings, bridge_landed=flown.bridge_landed(at_ns),
+            docked=flown.docks > docks,
+            holds=tuple(dict.fromkeys(s.reason for s in flown.states if s.since_ns >= at_ns and s.state == "hold")),
         )  # fmt: skip
+        self._touches = flown.touches
+        self.starts -= int(not seen.flew and seen.end in {*ENDED, "idle"})  # it never armed: no credit for another
         self._tell(line_of(seen))
         return seen
 
@@ -229,7 +240,7 @@ def line_of(seen: Seen) -> str:
     """Return one fault in a line."""
 
     def s(value: float | None) -> str:
-        return "-" if value is None else f"{value:.2f}" if value < _NEVER_S else "never"
+        return "-" if value is None else f"{value:.2f}" if value < NEVER_S else "never"
 
     return (
         f"{seen.what} in {seen.state} (at {seen.at_s:.0f} s): held {s(seen.held_s)} s, at rest {s(seen.rest_s)} s, noticed "

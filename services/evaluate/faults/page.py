@@ -18,7 +18,8 @@ _WHERE = {
     "chain": (
         "The real perception over a recording",
         "The real camera, slam, mapper, detector and refiner, fed with a rendered recording that goes forwards and backwards for as "
-        "long as is needed. A tree is lost when it does not stand under its id within 5 cm again.",
+        "long as is needed. A tree is lost when it does not stand under its id within 5 cm again, in the same map; the mapper must hold "
+        "the submaps that it held.",
     ),
     "machine": ("The machine", "What surrounds the processes."),
     "network": (
@@ -37,8 +38,10 @@ why, stands in [safety.md](safety.md).
 For every fault in flight these are measured, and the row fails when one does not hold: when somebody held or landed
 (simulated time, 0.15 s are uncertain of the fault's moment), touches, how often the aircraft was armed against the start
 commands given, whether the last start command is refused when it is sent once more, trees that were known before and are
-not after, and that a mission that ended says why and left the aircraft disarmed. A process that was killed or stopped must
-be back and READY within 3.5 s of its end, and no other process may have been started again.
+not after, and that a mission that ended says why and left the aircraft disarmed. A mission that does not need the process goes
+on, or holds before it ends where it needs it in the long run. A process that was killed or stopped must be back and READY
+within 3.5 s of its end (what its threads waited for a processor on a busy machine is not counted), and no other process may
+have been started again. What is touched between two faults counts with the second.
 
 The simulator is no row: it is the aircraft and the world, and there is nothing to hold when they are gone. `treedock run` then
 ends with that reason (`test_a_mission_whose_simulator_died_ends_and_says_so`).

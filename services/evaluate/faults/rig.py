@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -44,11 +45,13 @@ class Comeback:
     """From its end until another process of that service says that it is ready."""
     cpu_s: float
     """Processor time that the other process took for it."""
+    waited_s: float = 0.0
+    """How long its threads, runnable, waited for a processor meanwhile: a machine with more to do than processors."""
 
     def ready_after_s(self) -> float:
-        """Return when it was ready: by the wall, or on a machine that has more to do than processors by its own work."""
-        pause_s = SupervisorConfig().backoff_s
-        return min(self.back_s, pause_s + self.cpu_s) if os.getloadavg()[0] > (os.cpu_count() or 1) else self.back_s
+        """Return when it was ready by the wall, less what it waited for a processor; never less than its pause and its own work."""
+        own_s = min(self.back_s, SupervisorConfig().backoff_s + self.cpu_s)
+        return max(self.back_s - self.waited_s, own_s)
 
 
 @dataclass
@@ -74,8 +77,8 @@ class Rig:
         self._stack = ExitStack()
         self.heard_s: dict[str, float] = {}
         """When a service's latest health came."""
-        self._ready_s: dict[int, tuple[float, float]] = {}
-        """When a process (by its id) first said that it was ready, and its processor time until then."""
+        self._ready_s: dict[int, tuple[float, float, float]] = {}
+        """When a process (by its id) first said that it was ready, its processor time until then, and what it waited for one."""
         self.folder.mkdir(parents=True, exist_ok=True)
         self.write_configs()
         self.supervisor = Supervisor(self.services, self._spawn, self.config.supervisor)
@@ -121,7 +124,7 @@ class Rig:
         self.health[health.service], self.heard_s[health.service] = health, time.monotonic()
         self.supervisor.heard(health.service, health.pid, health.state)
         if health.state in _READY and health.pid not in self._ready_s:
-            self._ready_s[health.pid] = time.monotonic(), _cpu_s(health.pid)
+            self._ready_s[health.pid] = time.monotonic(), _cpu_s(health.pid), _waited_s(health.pid)
 
     # -- time
 
@@ -194,8 +197,8 @@ class Rig:
 
         if not self.until(back, timeout_s):
             return None
-        ready_s, cpu_s = self._ready_s[self.pid(service)]
-        return Comeback(service, ended_s - at_s, ready_s - ended_s, cpu_s)
+        ready_s, cpu_s, waited_s = self._ready_s[self.pid(service)]
+        return Comeback(service, ended_s - at_s, ready_s - ended_s, cpu_s, waited_s)
 
     def log_size(self, service: str) -> int:
         """Return how much a service has said so far, bytes."""
@@ -221,6 +224,15 @@ def _cpu_s(pid: int) -> float:
     except OSError:
         return float("inf")
     return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _waited_s(pid: int) -> float:
+    """Return how long a process's threads have waited for a processor (proc schedstat, second field); 0 where that is not told."""
+    waited_ns = 0
+    for path in Path(f"/proc/{pid}/task").glob("*/schedstat"):
+        with contextlib.suppress(OSError, IndexError, ValueError):
+            waited_ns += int(path.read_text(encoding="ascii").split()[1])
+    return waited_ns * 1e-9
 
 
 def _running(pid: int) -> bool:

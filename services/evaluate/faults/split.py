@@ -20,7 +20,7 @@ from services.common.config import TreedockConfig
 from services.common.process import prepare_process
 from services.common.timekeeping import told_ahead_s
 from services.evaluate.faults.hosts import HUB, Hosts, enter_fresh, why_not
-from services.evaluate.faults.missions import Back, Flights, Seen, line_of
+from services.evaluate.faults.missions import NEVER_S, Back, Flights, Seen, line_of
 from services.evaluate.faults.model import Result
 from services.evaluate.faults.rig import STANDINS, Rig
 from services.evaluate.faults.system import flight_config
@@ -33,11 +33,14 @@ PLACES = {
 AHEAD_S = {"A": 0.0, "B": 0.2, "C": -0.2}
 """By how much each machine's clock is ahead of the router's."""
 _CLOCK_S = 0.02
-_HEALTHS_S = 12.0
+_HEALTHS, _HEALTHS_S = 5, 12.0
+"""So many, and so long for them."""
 _MOMENT_S = 0.35
 """What is uncertain of a fault's moment: time is let run on after 0.3 s of silence, and the news is as old as the way."""
 _DOCK_WITHIN_S = 200.0
 _AGAIN_WITHIN_S = 30.0
+_DOWN_WITHIN_S = 120.0
+_ARMED_WITHIN_S = 60.0
 
 
 def split_rig(hosts: Hosts, seed: int, folder: Path, *, real: bool = False, waits: bool = True) -> Rig:
@@ -115,22 +118,19 @@ def _wrong_frames(rig: Rig, name: str) -> str:
 def clock_off_s(rig: Rig, name: str) -> tuple[float, float]:
     """Return how far ahead a service says its machine is, and how far its corrected clock is off this process's.
 
-    This process runs on the router's machine. The second is the best of several healths: each is late by its way here.
+    This process runs on the router's machine. The second is the greatest of several healths: each is late by its way here.
     """
-    best, before = float("inf"), rig.health[name].seq
-    end_s = time.monotonic() + _HEALTHS_S
+    seen, off_s = {rig.health[name].seq}, list[float]()
 
-    def close() -> bool:
-        nonlocal best, before
+    def enough() -> bool:
         health = rig.health[name]
-        if health.seq != before:
-            before = health.seq
-            off_s = health.stamp_ns * 1e-9 - (time.time() - (time.monotonic() - rig.heard_s[name]))
-            best = min(best, off_s, key=abs)
-        return abs(best) < 0.5 * _CLOCK_S
+        if health.seq not in seen:
+            seen.add(health.seq)
+            off_s.append(health.stamp_ns * 1e-9 - (time.time() - (time.monotonic() - rig.heard_s[name])))
+        return len(off_s) >= _HEALTHS
 
-    rig.until(close, end_s - time.monotonic())
-    return told_ahead_s(rig.health[name].counters) or 0.0, best
+    rig.until(enough, _HEALTHS_S)
+    return told_ahead_s(rig.health[name].counters) or 0.0, max(off_s, default=float("inf"))
 
 
 def _doctor(rig: Rig) -> list[str]:
@@ -164,16 +164,24 @@ def cut(
             rig.each = lambda: _looked_after_there(rig, host)
             if for_s < float("inf"):
                 rig.pump(for_s)
-            else:
-                rig.until(lambda: not rig.flown.armed, 120.0)
+            elif not rig.until(lambda: not rig.flown.armed, _DOWN_WITHIN_S):
+                failed.append(f"still armed {_DOWN_WITHIN_S:.0f} s after the cable was pulled: {rig.flown.state}")
             hosts.wire(host, up=True)
             rig.each = lambda: None
             poses, at_s = rig.flown.poses, time.monotonic()
-            back = rig.until(lambda: rig.flown.poses > poses + 5 and rig.all_ready, _AGAIN_WITHIN_S)
-            return Back(back_s=time.monotonic() - at_s if back else 1e9)
+            behind = [name for name, place in PLACES.items() if place == host]
+
+            def together() -> bool:
+                heard = all(rig.heard_s.get(name, 0.0) > at_s for name in behind)
+                return heard and rig.flown.poses > poses + 5 and rig.all_ready
+
+            back = rig.until(together, _AGAIN_WITHIN_S)
+            return Back(back_s=time.monotonic() - at_s if back else NEVER_S)
 
         for _ in range(moments):
             flights.moment()
+            if for_s == float("inf") and not rig.until(lambda: rig.flown.armed, _ARMED_WITHIN_S):
+                failed.append(f"never armed: {rig.flown.state}, {rig.flown.reason()}")
             one = flights.see(f"cable of {host} out for {for_s:g} s", pull)
             seen.append(one)
             failed += [f"{one.state}: {word}" for word in common(one)]
@@ -195,7 +203,11 @@ def _looked_after_there(rig: Rig, host: str) -> None:
 
 
 def _held_late(host: str, seen: Seen) -> list[str]:
-    if seen.state in {"hold", "landing"} or (seen.held_s is not None and seen.held_s <= HOLD_S + _MOMENT_S):
+    if (
+        seen.state in {"hold", "landing"}
+        or not seen.flew
+        or (seen.held_s is not None and seen.held_s <= HOLD_S + _MOMENT_S)
+    ):
         return []
     return [f"{host} cut: held after {seen.held_s} s, not within {HOLD_S} s"]
 
@@ -218,7 +230,7 @@ def in_namespaces(row: str, seed: int, moments: int, folder: Path, tell: Callabl
         try:
             out, err = done.communicate()
         except BaseException:  # a test's time limit, ctrl-c: its services must not outlive it
-            done.kill()
+            done.terminate()  # the namespaces' holders end with their parent
             raise
     for line in err.strip().splitlines()[-12:]:
         tell(line)

@@ -9,15 +9,15 @@ from services.evaluate.faults.flown import ENDED
 from services.evaluate.faults.missions import Seen
 
 HOLD_S = 0.5
-_MOMENT_S = 0.15
+MOMENT_S = 0.15
 """What is uncertain of the fault's moment in simulated time: how far the clock was ahead of what had been heard."""
 PX4_LEAVES_S = 1.4
 """PX4 leaves offboard so long after the last setpoint (measured on PX4 v1.16), and lands."""
-SILENT_S = 3.5 + 1.0
-"""Health is missed after 3.5 s, and is sent once a second."""
 _MOVING = frozenset({"take_off", "scan", "select", "face", "approach", "dock", "docked", "undock", "return"})
 _SIGHTED = frozenset({"approach", "dock"})
-_MAPPING = frozenset({"scan", "select", "face"})
+_AFTER_DOCKING = frozenset({"docked", "undock", "return", "landing"})
+_UNSEEN = frozenset({"recorder", "preview", "second_camera", "second_slam"})
+"""The mission does not know whether they live."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,13 +64,29 @@ def _flight(service: str, seen: Seen) -> Iterator[str]:
     """Yield what the aircraft did too late, by the safety table."""
     within_s = hold_within_s(service, seen.state)
     if within_s is None:
+        yield from _flies_on(service, seen)
         return
     if not seen.flew:  # it stays on the ground: failed, or forgotten by a navigator that begins anew
         if seen.end not in {"failed", "idle"}:
             yield f"not armed in {seen.state}, and then {seen.end} instead of failed"
         return
-    if seen.held_s is None or seen.held_s > within_s + _MOMENT_S:
+    if seen.held_s is None or seen.held_s > within_s + MOMENT_S:
         yield f"held after {seen.held_s} s in {seen.state}, not within {within_s} s"
+
+
+def _flies_on(service: str, seen: Seen) -> Iterator[str]:
+    """Yield what of a flight did not go on that does not need the service, or only when it is away for long: then it holds first."""
+    if goes_on(seen) or seen.state not in _MOVING or not seen.flew:
+        return
+    if service in _UNSEEN:
+        yield f"the mission ended ({seen.end}: {seen.reason}) although it does not need {service}"
+    elif not seen.holds and not seen.bridge_landed and service != "router":
+        yield f"the mission ended ({seen.end}: {seen.reason}) and never held before"
+
+
+def goes_on(seen: Seen) -> bool:
+    """Return whether a mission that a fault struck went on, or ended as one does that has docked."""
+    return seen.end in _MOVING | {"hold"} or seen.docked or seen.state in _AFTER_DOCKING
 
 
 def hold_within_s(service: str, state: str) -> float | None:

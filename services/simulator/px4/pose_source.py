@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from services.common.geometry import R_BODY_CAMERA, Matrix, pose
+from services.common.geometry import Matrix
+from services.common.mount import Mount
 from services.simulator.px4.frames import world_from_ned
 from services.simulator.px4.simulated import SimulatedPx4
 
@@ -14,19 +15,12 @@ SLICE_S = 0.008
 """Below TIMESYNC's ten milliseconds, so that an answer given between two slices still counts."""
 
 
-def body_camera(offset_m: tuple[float, float, float]) -> Matrix:
-    """Return ``T_body_camera`` of a camera that looks forward, ``offset_m`` (forward, left, up) from the body origin.
-
-    The same offset belongs in ``autopilot.camera_offset_m``: what differs is flown as an error.
-    """
-    return pose(R_BODY_CAMERA, offset_m)
-
-
 class FlyingCamera:
     """Carries the camera where the autopilot flies. ``advance`` lets simulated time pass, slice by slice.
 
     ``between(elapsed_s)`` is called after each slice with the simulated time since the start: publish the clock there
     and let a companion in another process take its turn. Without it a whole frame passes unheard: 70 ms more delay.
+    ``mount`` is the true one: what ``autopilot.camera_*`` differs from it is flown as an error.
     """
 
     scripted = False
@@ -34,12 +28,12 @@ class FlyingCamera:
     def __init__(
         self,
         px4: SimulatedPx4,
-        offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        mount: Mount | None = None,
         between: Callable[[float], None] | None = None,
         end_after_landing_s: float = 3.0,
     ) -> None:
         self.px4 = px4
-        self._T_body_camera = body_camera(offset_m)
+        self._T_body_camera = (mount or Mount.level((0.0, 0.0, 0.0))).T_body_camera
         self._between = between
         self._end_after_landing_s = end_after_landing_s
         self._acceleration = np.zeros(3)
