@@ -106,7 +106,18 @@ class Board:
     def here(self) -> Sample | None:
         """The last tracked pose while slam is trusted, else None."""
         fresh = self.inputs.age_s(self.inputs.pose) <= self.config.failsafe.pose_silent_s
-        return self.track.latest if fresh and not self.track.lost else None
+        return self.track.latest if fresh and not self.track.lost and not self.poses_late else None
+
+    @property
+    def pose_age_s(self) -> float:
+        """Seconds since the image of the last tracked pose was taken, infinite before the first."""
+        last = self.track.latest
+        return float("inf") if last is None else (self.now_ns - last.stamp_ns) / 1e9
+
+    @property
+    def poses_late(self) -> bool:
+        """Whether poses come, but of where the aircraft was: over a link that queues, or of a slam that cannot keep up."""
+        return not self.track.lost and self.pose_age_s > self.config.failsafe.pose_late_s
 
     @property
     def from_home_m(self) -> float:

@@ -83,6 +83,8 @@ class FailsafeConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     pose_silent_s: float = Field(default=0.4, gt=0.0, le=5.0)
+    pose_late_s: float = Field(default=0.7, gt=0.0, le=5.0)
+    """A pose whose image was taken longer ago than this is of where the aircraft was."""
     pose_land_s: float = Field(default=0.9, gt=0.0, le=5.0)
     """Without a pose for this long we land. PX4 gives up its position 1 s after the last vision (EKF2_NOAID_TOUT) and
     0.2 s of its own delay; until then it still lands on our word, and lands better: on its position as long as it can."""

@@ -144,6 +144,8 @@ def _slam(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
     if age > f.pose_silent_s:
         name, word = _who_is_silent(b)
         return Fault(name, response, f"{word}: no pose for {age:.1f} s", f.pose_hold_s, blind=True)
+    if b.poses_late:
+        return Fault("poses late", "hold", f"the poses come {b.pose_age_s:.1f} s late", f.pose_hold_s, blind=True)
     if b.track.lost:
         word = "slam lost its place" if response == "hold" else f"slam lost its place {blind_s:.1f} s ago: landing"
         return Fault("slam lost", response, word, f.pose_hold_s, blind=not b.carried)
@@ -225,10 +227,15 @@ def _eyes(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
     f = b.config.failsafe
     if doing not in GUARDED or not b.config.live_guard or b.config.handheld:
         return None
-    age_s = b.inputs.age_s(b.inputs.view)
-    if age_s <= f.view_silent_s:
+    if b.inputs.view_age_s <= f.view_silent_s:
         return None
-    return Fault("guard blind", "hold", "the live guard gets no depth images", f.obstacle_hold_s)
+    late = b.inputs.age_s(b.inputs.view) <= f.view_silent_s
+    word = (
+        f"the live guard's depth images are {b.inputs.view_age_s:.1f} s old"
+        if late
+        else "the live guard gets no depth images"
+    )
+    return Fault("guard blind", "hold", word, f.obstacle_hold_s)
 
 
 def _obstacle(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:

@@ -23,13 +23,11 @@ def missing(board: Board, config: NavigatorConfig) -> list[str]:
         faults.append(f"the place to start from is not claimed: {board.claims.word}")
     if config.handheld:
         return faults
-    if config.live_guard and board.inputs.age_s(board.inputs.view) > _VIEW_FRESH_S:
+    if config.live_guard and board.inputs.view_age_s > _VIEW_FRESH_S:
         faults.append("the live guard sees no depth images (navigator.live_guard=false flies without it)")
     v = board.vehicle
     if v is None:
         return [*faults, "no word from the autopilot"]
-    if v.armed:
-        faults.append("the vehicle is armed already")
     if not v.vision_fused:
         faults.append("the autopilot does not use the vision pose yet")
     if v.landed in ("in_air", "taking_off", "landing"):

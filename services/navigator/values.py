@@ -47,6 +47,12 @@ class Inputs:
         """Return the seconds since a message came, inf when none did."""
         return float("inf") if seen is None else (self.now_ns - seen.received_ns) / 1e9
 
+    @property
+    def view_age_s(self) -> float:
+        """Return the seconds since the last depth image was taken, inf before the first: one that comes late shows what was."""
+        seen = self.view
+        return float("inf") if seen is None else (self.now_ns - min(seen.received_ns, seen.message.stamp_ns)) / 1e9
+
     def service_age_s(self, name: str) -> float:
         """Return the seconds since a service's last health, inf when it never spoke."""
         at = self.services.get(name)

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from collections import deque
+from typing import Any
+
 import numpy as np
 import pytest
 
 from services.navigator.config import NavigatorConfig
+from services.navigator.guard import View
+from services.navigator.values import Seen
 from tests.unit.navigator_world import STEP_S, World, flying, tree
 
 
@@ -198,6 +203,74 @@ def test_the_bridges_own_word_tells_who_ended_it(armed: bool, mode: str) -> None
     world.step()
     assert world.state == "released"
     assert "component 195 sends setpoints too: landing" in world.mission.reason
+
+
+# -- what comes late, and who arms
+
+
+class Delayed(World):
+    """Depth images or poses come, each so many steps after it was taken."""
+
+    late_views = late_poses = 0
+
+    def _view(self) -> Seen[View] | None:
+        return self._delayed("views", super()._view(), self.late_views)
+
+    def _sense(self) -> None:
+        super()._sense()
+        self._pose = self._delayed("poses", self._pose, self.late_poses)
+
+    def _delayed(self, name: str, seen: Any, steps: int) -> Any:
+        queue = self.__dict__.setdefault(name, deque())
+        if seen is None:
+            return None
+        queue.append(seen.message)
+        while len(queue) > steps + 1:
+            queue.popleft()
+        return Seen(queue[0], self.now_ns)
+
+
+@pytest.mark.parametrize("late_s", [0.6, 1.0, 2.0])
+def test_depth_images_of_what_was_guard_nothing(late_s: float) -> None:
+    world = Delayed(trees=[tree(1, 5.0, 0.0)])
+    world.start()
+    assert world.run("approach") == "approach"
+    world.late_views = round(late_s / STEP_S)
+    world.run("hold", 2.0)
+    assert world.state == "hold"
+    assert f"depth images are {late_s:.1f} s old" in world.mission.reason or "depth images are" in world.mission.reason
+    world.walkers = [ahead(world, 0.95)]
+    world.run(seconds=3.0)
+    assert world.least_m > 0.6, "it stands, and nobody is run into"
+
+
+def test_poses_of_where_it_was_are_not_flown_by() -> None:
+    world = Delayed()
+    world.start()
+    assert world.run("approach") == "approach"
+    world.late_poses = round(1.5 / STEP_S)
+    assert world.run("hold", 3.0) == "hold"
+    assert "late" in world.mission.reason
+    assert world.mission.board.here is None
+    world.late_poses = 0
+    world.run(seconds=2.0)
+    assert world.state in ("approach", "face", "select"), world.mission.reason
+
+
+def test_who_arms_while_preflight_waits_has_the_aircraft() -> None:
+    world = World()
+    world.run(seconds=1.0)
+    world.slam = "lost"
+    world.start()
+    world.run(seconds=3.0)
+    assert world.state == "preflight"
+    world.armed, world.mode = True, "position"
+    world.run(seconds=1.0)
+    assert world.state == "failed"
+    assert "armed, not by us" in world.mission.reason
+    world.armed, world.slam = False, "tracking"
+    world.run(seconds=30.0)
+    assert (world.state, world.armed, world.armings) == ("failed", False, 0), "it never takes off by itself afterwards"
 
 
 # -- the battery

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import signal
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -33,7 +34,8 @@ _RATE_HZ = 15.0
 _SAME_M = 0.05
 _READY_WITHIN_S = 300.0
 _SEEN_WITHIN_S = 90.0
-_MOST_SUBMAPS = 0.9
+_MOST_SUBMAPS, _SAVED_WITHIN_S = 0.9, 15.0
+"""What the mapper took up since it saved last, every 10 s, goes with it."""
 _STAYS_S = 6.0
 """Longer than the mapper takes to tell what it holds, twice, and the detector to draw its conclusions."""
 
@@ -45,9 +47,8 @@ class Chain:
     rig: Rig
     frames: Sequence[RgbdFrame]
     poses: list[Pose] = field(default_factory=list)
-    index: MapIndex | None = None
-    """What the mapper holds, as told last; and when that was heard."""
-    index_heard_s: float = 0.0
+    held: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=1000))
+    """When the mapper told what it holds, and how many submaps."""
 
     @classmethod
     def over_a_recording(cls, seed: int | None, folder: Path, tell: Callable[[str], None]) -> Chain:
@@ -102,12 +103,13 @@ class Chain:
         del self.poses[:-2000]
 
     def _on_index(self, index: MapIndex) -> None:
-        self.index, self.index_heard_s = index, time.monotonic()
+        self.held.append((time.monotonic(), len(index.submap_ids)))
 
     @property
     def submaps(self) -> int:
-        """Return how many submaps the mapper holds."""
-        return len(self.index.submap_ids) if self.index is not None else 0
+        """Return how many submaps the mapper held when it must last have saved them."""
+        saved_s = time.monotonic() - _SAVED_WITHIN_S
+        return next((count for at_s, count in reversed(self.held) if at_s <= saved_s), 0)
 
     @property
     def trees(self) -> TreeList | None:
@@ -153,7 +155,7 @@ class Chain:
         least = int(_MOST_SUBMAPS * submaps)
 
         def mapped() -> bool:
-            return self.index_heard_s > asked_s and self.submaps >= least
+            return bool(self.held) and self.held[-1][0] > asked_s and self.held[-1][1] >= least
 
         def whole() -> bool:
             nonlocal missing
@@ -171,7 +173,7 @@ class Chain:
             if whole():
                 return []
         words = [f"tree {number} is lost" for number in missing]
-        words += [f"the mapper holds {self.submaps} submaps of {submaps}"] * (not mapped())
+        words += [f"the mapper holds {self.held[-1][1] if self.held else 0} submaps of {submaps}"] * (not mapped())
         words += ["slam began another map"] * (not anew and bool(self.poses) and self.poses[-1].map_id != before.map_id)
         return words + ["no pose any more"] * (self.located_since(0) < 15)
 

@@ -19,7 +19,7 @@ _WHERE = {
         "The real perception over a recording",
         "The real camera, slam, mapper, detector and refiner, fed with a rendered recording that goes forwards and backwards for as "
         "long as is needed. A tree is lost when it does not stand under its id within 5 cm again, in the same map; the mapper must hold "
-        "the submaps that it held.",
+        "the submaps that it had saved (every 10 s).",
     ),
     "machine": ("The machine", "What surrounds the processes."),
     "network": (

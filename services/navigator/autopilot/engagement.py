@@ -146,8 +146,8 @@ class Engagement:
         return step(vehicle, now_ns)
 
     def _refused(self, vehicle: Vehicle) -> bool:
-        """Whether the pilot chose another mode while we were asking for offboard."""
-        return vehicle.mode not in (self._mode_before, OFFBOARD)
+        """Whether the pilot chose another mode while we were asking for offboard, or armed: then he means to fly."""
+        return vehicle.mode not in (self._mode_before, OFFBOARD) or vehicle.armed
 
     def _stream(self, vehicle: Vehicle, now_ns: int) -> list[Order]:
         if self._refused(vehicle):
@@ -192,6 +192,8 @@ class Engagement:
         if not vehicle.armed:
             self._go("released", "disarmed, not by us", now_ns)
             return []
+        if self._taken_back(now_ns):
+            return self._begin_landing("the navigator took its order back: landing", now_ns)
         g = self.usable(now_ns)
         self._foreign = vehicle.foreign
         if g is None or self._foreign:
@@ -206,6 +208,12 @@ class Engagement:
             self.note = f"engaged for mission {self.mission_id}"
         self._hold_since_ns = None
         return self._begin_landing("landing as ordered", now_ns) if g.land else []
+
+    def _taken_back(self, now_ns: int) -> bool:
+        """Whether our mission's navigator says, freshly, that nothing is to be flown: it ended it while we were arming."""
+        g = self._guidance
+        ours = g is not None and g.mission_id == self.mission_id and not g.engage
+        return ours and (now_ns - self._heard_ns) / 1e9 <= self.config.guidance_stale_s
 
     def _begin_landing(self, note: str, now_ns: int) -> list[Order]:
         self._go("landing", note, now_ns)
@@ -230,9 +238,11 @@ class Engagement:
         return []
 
     def _release(self, vehicle: Vehicle, now_ns: int) -> list[Order]:
+        engaging = self.phase in ("streaming", "switching") and vehicle.mode in (self._mode_before, OFFBOARD)
+        found = "armed" if engaging else f"mode {vehicle.mode}"
         self._go(
             "released",
-            f"mode {vehicle.mode}, not by us: "
+            f"{found}, not by us: "
             + ("PX4 acts by its own failsafe" if vehicle.failsafe else "the pilot has the aircraft, or PX4's failsafe"),
             now_ns,
         )
