@@ -12,6 +12,7 @@ from services.common.geometry import Matrix, wrap_angle
 from services.navigator.board import Board
 from services.navigator.routing import docking_place, route, unknown_ahead
 from services.navigator.trajectory import Aim
+from services.navigator.underfoot import least_z_m
 from services.navigator.values import Intent, Next
 
 FACING_RAD = float(np.radians(5.0))
@@ -103,8 +104,9 @@ def gone(b: Board) -> Next:
 
 
 def at_height(b: Board, xy: Matrix) -> Matrix:
-    """Return a place (3,) at flight height."""
-    return np.array([xy[0], xy[1], b.flight_z_m])
+    """Return a place (3,) at flight height, higher where the known ground there, or under the aircraft, asks for it."""
+    least = max(least_z_m(b, xy), least_z_m(b, b.trajectory.position_m[:2]))
+    return np.array([xy[0], xy[1], min(max(b.flight_z_m, least), b.ceiling_z_m)])
 
 
 def yaw_to_axis(b: Board) -> float:

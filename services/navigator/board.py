@@ -18,6 +18,7 @@ from services.navigator.selection import axis_at
 from services.navigator.surroundings import Surroundings
 from services.navigator.track import Correction, PoseTrack, Sample, Step, TrackLimits
 from services.navigator.trajectory import Fence, Trajectory
+from services.navigator.underfoot import foot_left_m
 from services.navigator.values import Inputs
 
 _BARK_MARGIN_M, _TARGET_BARK_M = 0.30, 0.45
@@ -51,6 +52,8 @@ class Board:
     """Filtered trunk axis x, y (2,) of the target."""
     ground_z_m: float = 0.0
     """Of the target's foot."""
+    left_foot_m: Matrix | None = None
+    """Foot (3,) of the tree left last: the aircraft may still hang over that ground."""
     visited_ids: list[int] = field(default_factory=list)
     given_up_ids: list[int] = field(default_factory=list)
     done_xy_m: list[Matrix] = field(default_factory=list)
@@ -194,7 +197,12 @@ class Board:
         level = home_z + self.config.flight_height_m - self.config.start_height_m
         if self.axis_m is None:
             return level
-        return min(max(level, self.ground_z_m + self.config.min_ground_m), home_z + self.config.motion.fence_height_m)
+        return min(max(level, self.ground_z_m + self.config.min_ground_m), self.ceiling_z_m)
+
+    @property
+    def ceiling_z_m(self) -> float:
+        """The greatest height of the camera in map."""
+        return (0.0 if self.home_m is None else float(self.home_m[2])) + self.config.motion.fence_height_m
 
     def discs(self, keep_out_m: float) -> list[Disc]:
         """Return what is in the way but the target, grown by ``keep_out_m``: listed trunks, seen things, moving ones."""
@@ -289,6 +297,7 @@ class Board:
 
     def drop_target(self) -> None:
         """Have no target any more."""
+        self.left_foot_m = foot_left_m(self)
         self.target_id, self.axis_m, self.dock_direction, self.target_seen_ns = None, None, None, None
         self.looking, self.following.astray = False, ""
         self.dock.clear()
@@ -301,6 +310,8 @@ class Board:
         self.around.correct(c)
         if self.home_m is not None:
             self.home_m = c.point(self.home_m)
+        if self.left_foot_m is not None:
+            self.left_foot_m = c.point(self.left_foot_m)
         if self.axis_m is not None:
             self.axis_m = flat(self.axis_m)
         if self.dock_direction is not None:
@@ -331,6 +342,8 @@ class Board:
         moved = after.position_m - before.position_m
         if self.home_m is not None:
             self.home_m = self.home_m + moved
+        if self.left_foot_m is not None:
+            self.left_foot_m = self.left_foot_m + moved
         fence = self.trajectory.fence
         if fence is not None:
             flown = float(np.linalg.norm(before.position_m[:2] - fence.centre_m[:2]))

@@ -140,7 +140,7 @@ class NavigatorConfig(BaseModel):
     """Camera above ground at the start (the map's origin)."""
     flight_height_m: float = Field(default=1.5, gt=0.0, le=50.0)
     min_ground_m: float = Field(default=1.0, gt=0.0, le=20.0)
-    """Least height over the ground at the target's foot: the aircraft rises on a slope."""
+    """Least height over the known ground, at the target's foot and below the aircraft: it rises on a slope."""
     climb_speed_m_s: float = Field(default=0.4, gt=0.0, le=2.0)
     scan_rate_rad_s: float = Field(default=math.radians(25.0), gt=0.0, le=math.pi)
     scan_overlap_rad: float = Field(default=math.radians(20.0), ge=0.0, le=3.2)
