@@ -24,6 +24,8 @@ Answer = Literal["held", "asking", "refused"]
 _ON_THE_GROUND: frozenset[MissionStateName] = frozenset({"idle", "landed", "failed", "released"})
 _FREE: frozenset[MissionStateName] = frozenset({"landing", "preflight"})
 """States that go on without a claim: coming down is the answer to its loss."""
+_COME_DOWN_S = 8.0
+"""With less left of a lost claim the aircraft comes down from where it is: from 3 m that takes 6 s."""
 
 
 @dataclass
@@ -125,9 +127,18 @@ class Claims:
         refusal = self.view.refusal
         return self.view.note or (refusal.reason if refusal is not None else "") or "waiting for the arbiter"
 
+    def backing_off(self, state: MissionStateName) -> bool:
+        """Whether the claim is lost and acted upon: nothing shall stop the aircraft on its way from the trunk."""
+        return self.leaving and state == "undock"
+
+    @property
+    def must_land(self) -> bool:
+        """Whether what stopped the backing off may stop it no longer: the lease is about to end."""
+        return self.leaving and self.view.left_s < _COME_DOWN_S
+
     def lost(self, state: MissionStateName) -> str:
         """Return why the aircraft can no longer count on its claim, empty while it can."""
-        if not self.on or self.leaving or state in _ON_THE_GROUND | _FREE:
+        if not self.on or self.backing_off(state) or state in _ON_THE_GROUND | _FREE:
             return ""
         if self.view.broken:
             return f"claim lost: {self.view.broken}"

@@ -265,9 +265,8 @@ def _unseen(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
 
 
 def _ground_link(w: Watch, b: Board, doing: MissionStateName) -> Fault | None:
-    del doing
     f = b.config.failsafe
-    if b.claims.leaving or not w.ground_seen or b.inputs.service_age_s("station") <= f.ground_silent_s:
+    if b.claims.backing_off(doing) or not w.ground_seen or b.inputs.service_age_s("station") <= f.ground_silent_s:
         return None
     return Fault("ground link lost", "hold", "the ground station is out of reach", f.ground_hold_s)
 

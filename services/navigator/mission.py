@@ -121,6 +121,10 @@ class Mission:
         """Do what the fault in force asks for."""
         fault = self.fault
         self._time_fault(fault, now_ns)
+        released = fault is not None and fault.response == "release"
+        if self.state == "hold" and self.board.claims.must_land and not released:
+            self.go(Next("landing", "the claim ends: landing here"), now_ns)
+            return
         if fault is None:
             if self.state == "hold":
                 self._wait_in_hold(now_ns)
@@ -190,6 +194,9 @@ class Mission:
 
     def leave_hold(self, reason: str, now_ns: int) -> None:
         """Go on with what the hold interrupted, as far as that is still possible."""
+        if self.board.claims.leaving:  # no place is ours any more but the one below
+            self.go(Next("landing", f"{reason}; without a claim"), now_ns)
+            return
         target = _RESUME.get(self._resume, self._resume)
         if target in ("face", "approach", "docked", "undock") and self.board.axis_m is None:
             target = "select"
