@@ -44,6 +44,8 @@ class Mission:
         self.reason = "waiting for a start command"
         self.since_ns = 0
         self.mission_id = 0
+        self.adopted = False
+        """The mission was under way when we were started: where its start is, only the map's origin tells."""
         self.board = Board(config)
         self.watch = Watch()
         self.fault: Fault | None = None
@@ -69,7 +71,7 @@ class Mission:
         self.board.inputs, self.board.track = board.inputs, board.track
         self.board.trees_wanted = self.config.trees_wanted
         self.watch.begin(self.mission_id)
-        self._hold_cause = "fault"
+        self._hold_cause, self.adopted = "fault", False
         self.go(Next("preflight", f"mission {self.mission_id} ordered"), now_ns)
 
     # -- the step -----------------------------------------------------------------------------------------------
@@ -106,13 +108,15 @@ class Mission:
     def _adopt(self, now_ns: int) -> None:
         """Take over an aircraft that flies under our setpoints when we were started: hold, then land."""
         v = self.board.vehicle
+        if self.adopted and self.board.trajectory.fence is None:  # there was no pose yet: no flight without a fence
+            self._prepare_flight()
         if self.state != "idle" or self.mission_id or v is None or self.config.handheld:
             return
         if v.engaged_mission_id and v.armed and v.mode == "offboard" and not v.operator_override:
             self.mission_id = v.engaged_mission_id
             self.watch.begin(self.mission_id)
             self.board.trees_wanted = self.config.trees_wanted
-            self._resume, self._hold_cause = "select", "restart"
+            self._resume, self.adopted = "select", True
             self._prepare_flight()
             word = "the navigator was restarted in flight: holding, then landing"
             self.hold(Fault("", "hold", word, self.config.failsafe.restart_hold_s), "restart", now_ns)
@@ -267,8 +271,8 @@ class Mission:
         if here is None:
             return
         self.board.home_m = here.position_m.copy()
-        if self._hold_cause == "restart":  # adopted in flight: the map's origin is the start
-            self.board.home_m = np.zeros(3)
+        if self.adopted:  # the map's origin is the start, unless the map was begun anew: nothing to fly back to
+            self.board.home_m, self.board.home_known = np.zeros(3), False
         else:  # whatever became of the map before, here is the start
             self.board.home_known, self.board.map_changed = True, False
         home = self.board.home_m

@@ -35,3 +35,37 @@ def test_the_next_fresh_pose_is_where_it_holds() -> None:
     assert world.state == "hold"
     assert outputs.guidance.setpoint is not None
     assert outputs.guidance.setpoint.position_m == pytest.approx(tuple(AWAY), abs=0.01)
+
+
+def test_the_start_of_an_adopted_mission_is_the_maps_origin_and_not_where_it_hung() -> None:
+    """Also when the vehicle's word came before the first pose, and the operator said hold and resume."""
+    world = flying()
+    world._sense()
+    world.mission.step(Inputs(world.now_ns, None, None, None, world._vehicle, dict(world._seen_ns), None))
+    world.run(seconds=1.0)
+    board = world.mission.board
+    assert board.trajectory.fence is not None, "no flight without a geofence"
+    assert world.mission.order("hold", None, world.now_ns).accepted
+    world.run(seconds=1.0)
+    assert world.mission.order("resume", None, world.now_ns).accepted
+    assert board.home_m == pytest.approx(np.zeros(3))
+    assert board.trajectory.fence.centre_m == pytest.approx(np.zeros(3))
+    assert board.flight_z_m == pytest.approx(1.4)
+
+
+def test_an_adopted_mission_does_not_fly_back_to_a_start_that_it_has_not_seen() -> None:
+    world = flying()
+    world.run(seconds=1.0)
+    assert world.state == "hold"
+    assert not world.mission.board.home_known
+
+
+def test_the_mission_after_an_adopted_one_starts_where_it_stands() -> None:
+    world = flying()
+    assert world.run("landed", 60.0) == "landed"
+    world.start()
+    assert world.run("scan", 60.0) == "scan"
+    board = world.mission.board
+    assert board.home_known
+    assert board.home_m is not None
+    assert board.home_m[:2] == pytest.approx(AWAY[:2], abs=0.2)
