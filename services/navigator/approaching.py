@@ -97,8 +97,10 @@ def give_up(b: Board, reason: str) -> Next:
 
 
 def gone(b: Board) -> Next:
-    """Choose anew, as the target is not in the map any more or its id is another tree's; it is not given up for good."""
+    """Choose anew, as the target is not in the map any more or its id is another tree's; given up at the second time."""
     why = b.following.astray or "the target is gone from the map"
+    if b.following.astray and b.following.astray_again:
+        return give_up(b, f"{why}, again")
     b.drop_target()
     return Next("select", why)
 

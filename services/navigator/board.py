@@ -275,8 +275,8 @@ class Board:
         self.following.list_version, self.following.astray = -1, ""
         self.target_since_ns, self.looking = self.now_ns, False
         self.ground_z_m = tree.z_m
-        self.axis_m = self.target_seen_ns = None
-        self.axis_m = axis_at(tree, self.flight_z_m)
+        self.axis_m, self.target_seen_ns = np.array([tree.x_m, tree.y_m]), None
+        self.axis_m = axis_at(tree, self.flight_z_m)  # with a target it is the height that the list is compared at
         self.dock.clear()
         self.dock_direction, self.corners, self.planned_ns = None, [], -1
         self.dock_offset_m = self.dock_yaw_rad = 0.0

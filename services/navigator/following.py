@@ -31,6 +31,10 @@ class Following:
     """The depth image shows a trunk where the map has none: not our target, whatever its id."""
     astray: str = ""
     """Why the target's id names another tree now; empty when it does not."""
+    astray_again: bool = False
+    """It was so before, in the same list: choosing anew would change nothing."""
+    _astray_at: tuple[int, int] | None = None
+    """Id and version of the list when it last was."""
     _stamp_ns: int = -1
 
     def list_changed(self, b: Board) -> None:
@@ -51,11 +55,15 @@ class Following:
             distance, _, at_place = min(near, default=(float("inf"), 0, None))
             if at_place is None or distance > SAME_TREE_M:
                 if named is not None:
-                    self.astray = f"the list has tree {b.target_id} {off_m:.1f} m from where it was"
+                    self._went_astray(named.id, f"the list has tree {named.id} {off_m:.1f} m from where it was")
                 return
             named, b.target_id = at_place, at_place.id
         if b.target_seen_ns is None:
             b.axis_m, b.ground_z_m = axis_at(named, z), named.z_m
+
+    def _went_astray(self, tree_id: int, why: str) -> None:
+        at = (tree_id, self.list_version)
+        self.astray, self.astray_again, self._astray_at = why, at == self._astray_at, at
 
     def target_seen(self, b: Board) -> None:
         """Take the target's sight of this step, unless it cannot be our trunk."""

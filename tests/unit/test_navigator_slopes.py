@@ -1,4 +1,4 @@
-"""On a slope: never down into the ground that is known."""
+"""On a slope: never down into the ground that is known, and no argument with the list about a leaning trunk's place."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import pytest
 
 from schemas.trees import Tree
 from services.navigator.approaching import at_height
+from services.navigator.board import Board
 from services.navigator.config import NavigatorConfig
 from tests.unit.navigator_world import World, flying, tree
 
@@ -78,3 +79,30 @@ def test_the_ground_of_a_tree_just_left_is_remembered_in_a_list_without_it() -> 
     world._sense()
     board.inputs = board.inputs.__class__(world.now_ns, world._pose, world._trees)
     assert at_height(board, world.position_m[:2])[2] == pytest.approx(high_m, abs=0.1)
+
+
+def test_a_leaning_tree_uphill_is_faced_once() -> None:
+    lean = np.radians(18.5)
+    leaning = tree(1, 6.0, 0.5, z_m=2.0).model_copy(update={"axis": (0.0, float(np.sin(lean)), float(np.cos(lean)))})
+    world = World(trees=[leaning])
+    world.start()
+    world.run("select")
+    before = len(world.events)
+    world.run(seconds=10.0)
+    assert len(world.events) - before <= 2, world.mission.reason
+
+
+def test_a_tree_astray_twice_in_one_list_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    def misplaced(board: Board, chosen: Tree) -> None:
+        choose(board, chosen)
+        assert board.axis_m is not None
+        board.axis_m = board.axis_m + np.array([0.8, 0.0])
+
+    world = World(trees=[tree(1, 4.0, 1.0)])
+    world.start()
+    world.run("select")
+    choose = Board.choose
+    monkeypatch.setattr(Board, "choose", misplaced)
+    assert world.run("landing", 40.0) == "landing", world.mission.reason
+    assert world.mission.board.given_up_ids == [1]
+    assert sum(e.after == "face" for e in world.events) == 2, "once may be an accident"
