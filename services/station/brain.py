@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from schemas.command import CommandReply
-from schemas.orders import CommandName
+from schemas.orders import STOPS, CommandName
 from services.station.aircraft import Aircraft
 from services.station.config import StationConfig
 from services.station.events import Event, EventLevel, EventLog
@@ -222,7 +222,7 @@ class Brain:
         refusal = self.desk.refusal(operator, order.uav, order.name)
         if (order.name == "choose") != (order.tree_id is not None):
             refusal = "choose takes the id of a tree, no other order does"
-        elif shown_s is None or now_s - shown_s > self.config.view_stale_s:
+        elif order.name not in STOPS and (shown_s is None or now_s - shown_s > self.config.view_stale_s):
             old = "unknown" if shown_s is None else f"{now_s - shown_s:.1f} s old"
             refusal = f"stale: the page showed a state that is {old}; look again"
         if refusal:

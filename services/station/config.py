@@ -34,7 +34,7 @@ class StationConfig(BaseModel):
     page_hz: float = Field(default=5.0, gt=0.0, le=30.0)
     """How often a browser gets the state of all aircraft."""
     view_stale_s: float = Field(default=3.0, gt=0.0)
-    """A command is refused when what its browser shows is older than this."""
+    """An order that is no stop is refused when what its browser shows is older than this."""
     keep_command_s: float = Field(default=10.0, ge=0.0)
     """An operator whose browser is gone stays in command for this long."""
     command_timeout_s: float = Field(default=2.0, gt=0.0)

@@ -128,13 +128,14 @@ def test_forged_and_stale_requests_are_refused_and_logged(ground: Ground) -> Non
     assert until(lambda: client.mission() is not None)  # its token and its health may be heard before its mission
     assert client.aircraft() == ["uav1"]
     assert until(lambda: client.order("start")["accepted"])
-    assert "stale" in client.ask(t="order", uav="uav1", name="land", seen=0)["reason"]
+    assert "stale" in client.ask(t="order", uav="uav1", name="resume", seen=0)["reason"]
     assert "repeated" in client.ask(t="order", uav="uav1", name="land", seen=client.state["n"], id=1)["reason"]
     client.say(t="order", uav="uav1", name="explode", seen=1, id=99)
     client.socket.send("]")
     client.socket.send(b"\x00\x01")
     assert until(lambda: client.hear("events") is not None and sum("forged or broken" in e for e in client.events) >= 3)
     assert client.mission() not in (None, "landing")
+    assert client.ask(t="order", uav="uav1", name="land", seen=0)["accepted"], "a stop is never too late"
 
 
 def test_a_flood_of_requests_ends_the_page_not_the_station(ground: Ground) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from hypothesis import given
@@ -15,6 +15,7 @@ from schemas.envelope import DecodeError
 from schemas.fusion import EarthPlace, FusionState
 from schemas.health import Health
 from schemas.navigation import MissionState
+from schemas.orders import STOPS, CommandName
 from schemas.slam import Pose
 from schemas.topics import MISSION_STATE, SLAM_POSE, TREES_LIST, VEHICLE_STATE
 from schemas.trees import TreeList
@@ -180,6 +181,28 @@ def test_an_order_from_a_page_that_shows_an_old_state_is_refused_and_logged() ->
     assert "stale" in desk.ask(1, t="order", name="start", seen=10**9)["reason"]
     assert not desk.orders
     assert sum("refused by the station: stale" in line for line in desk.log()) == 2
+
+
+@pytest.mark.parametrize("stop", sorted(STOPS))
+@pytest.mark.parametrize("seen", [1, 10**9])
+def test_a_stop_passes_however_old_the_state_that_the_page_shows(stop: str, seen: int) -> None:
+    desk = Desk(view_stale_s=3.0)
+    desk.join(1, "Anna")
+    desk.now_s += 60.0
+    desk.brain.tell_state(desk.now_s)
+    desk.ask(1, t="order", name=stop, seen=seen)
+    assert [order.name for order in desk.orders] == [stop]
+    assert desk.brain.refused == 0
+
+
+@pytest.mark.parametrize("name", sorted(set(get_args(CommandName)) - STOPS))
+def test_whatever_moves_the_aircraft_is_refused_from_a_page_that_shows_an_old_state(name: str) -> None:
+    desk = Desk(view_stale_s=3.0)
+    desk.join(1, "Anna")
+    desk.now_s += 60.0
+    which = {"tree_id": 3} if name == "choose" else {}
+    assert "stale" in desk.ask(1, t="order", name=name, seen=1, **which)["reason"]
+    assert not desk.orders
 
 
 def test_a_repeated_request_an_unknown_aircraft_and_a_misplaced_tree_are_refused() -> None:
