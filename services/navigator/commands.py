@@ -15,6 +15,8 @@ from schemas.orders import STOPS
 
 _MAX_NONCES = 64
 _PER_SENDER = 4
+_MOST_SKIPPED = 1000
+"""Numbers that a command may leave out: who could name the last one of all would end every later command, and the navigator."""
 
 
 @dataclass
@@ -56,6 +58,8 @@ class CommandDesk:
             return f"the nonce was given to another sender, not to {command.sender}"
         if command.sequence < entry.next_sequence:
             return f"replayed: sequence {command.sequence}, expected {entry.next_sequence} or more"
+        if command.sequence > entry.next_sequence + _MOST_SKIPPED:
+            return f"sequence {command.sequence} is more than {_MOST_SKIPPED} above {entry.next_sequence}, the expected one"
         if command.name not in STOPS and command.sequence <= self._stopped_at:
             return f"overtaken: {command.name} was on its way when a hold, land or abort was carried out; say it again"
         entry.next_sequence = command.sequence + 1

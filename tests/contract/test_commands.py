@@ -64,6 +64,20 @@ def test_sequences_rise_over_all_nonces() -> None:
     assert desk.issue("ground", 0).next_sequence == 42
 
 
+@pytest.mark.parametrize("sequence", [2**63 - 1, 1002])
+def test_no_sender_can_use_up_the_numbers(sequence: int) -> None:
+    desk = _desk()
+    fresh = desk.issue("ground", 0)
+    assert "1000 above" in desk.refusal(_command(fresh, sequence), 0)
+    assert desk.issue("other", 0).next_sequence == 1
+    assert desk.refusal(_command(fresh), 0) == ""
+
+
+def test_a_sequence_a_little_above_the_expected_one_is_taken() -> None:
+    desk = _desk()
+    assert desk.refusal(_command(desk.issue("ground", 0), 1001), 0) == ""
+
+
 @pytest.mark.parametrize("stop", ["hold", "land", "abort"])
 def test_a_stop_has_the_last_word_over_what_was_on_its_way(stop: str) -> None:
     desk = _desk()
