@@ -86,6 +86,7 @@ def _serve(context: LiveContext, build: Build, stop: StopSignal) -> int:
         waiting = overdue.update() if overdue else ""
         context.bus.count_overflows()
         tell(context.wall, context.health)
+        context.health.note("clock", sync.word)
         expiry.tell(context.health, dt.datetime.now(dt.UTC))
         health = reporter.report(context.wall.now_ns(), context.bus.passed, state, waiting)
         context.publish(HEALTH, health, context.service)
@@ -103,8 +104,8 @@ def _serve(context: LiveContext, build: Build, stop: StopSignal) -> int:
             report()
 
     expiry = Expiry(context.config.security, context.uav, context.service)
+    sync = ClockSync(context.service, context.wall, context.bus)
     if context.service != "router":
-        sync = ClockSync(context.service, context.wall, context.bus)
         sync.begin()
         sync.keep(lambda: stop.is_set)
     report("starting")

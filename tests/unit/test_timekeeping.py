@@ -14,7 +14,7 @@ from services.common.clock_sync import ClockSync
 from services.common.config import TreedockConfig
 from services.common.context import HealthBook
 from services.common.memory import Hub, MemoryContext
-from services.common.timekeeping import OffsetFilter, tell, told_ahead_s
+from services.common.timekeeping import KEPT, OffsetFilter, tell, told_ahead_s
 from services.router.keeper import TimeKeeper
 
 MS = 1_000_000
@@ -44,8 +44,13 @@ class Router:
     def __init__(self, ahead_ns: int) -> None:
         self.clock, self.ahead_ns = WallClock(), ahead_ns
         self.there = True
+        self.deaf_for = 0
+        """Questions that it does not answer at first."""
 
     def ask(self, *_: object, **__: object) -> Sequence[ClockReply]:
+        if self.deaf_for:
+            self.deaf_for -= 1
+            return []
         return [ClockReply(stamp_ns=self.clock.machine_ns() + self.ahead_ns)] if self.there else []
 
 
@@ -68,6 +73,44 @@ def test_without_an_answer_the_clock_is_left_alone() -> None:
     router.there = False
     ClockSync("slam", wall, router).begin()
     assert wall.correction_ns == 0
+
+
+def test_a_router_that_answers_a_moment_later_is_waited_for() -> None:
+    wall, router = WallClock(ahead_s=3600.0), Router(0)
+    router.deaf_for = 3
+    ClockSync("slam", wall, router).begin()
+    assert abs(wall.correction_ns + 3600 * 10**9) < 5 * MS
+
+
+def test_a_first_answer_that_comes_late_never_steps_a_working_service_by_hours() -> None:
+    now_s = [100.0]
+    wall, router = WallClock(), Router(-3600 * 10**9)
+    router.there = False
+    sync = ClockSync("navigator", wall, router, lambda: now_s[0])
+    sync.begin()
+    router.there = True
+    now_s[0] += 62.0
+    for _ in range(3):
+        sync.once()
+        assert wall.correction_ns == 0
+        assert "3600.0 s" in sync.word
+    router.ahead_ns = 0
+    for _ in range(KEPT):
+        sync.once()
+    assert sync.word == ""
+
+
+def test_a_first_answer_that_comes_late_corrects_less_than_a_second() -> None:
+    now_s = [100.0]
+    wall, router = WallClock(), Router(OFF_NS)
+    router.there = False
+    sync = ClockSync("navigator", wall, router, lambda: now_s[0])
+    sync.begin()
+    router.there = True
+    now_s[0] += 62.0
+    sync.once()
+    assert abs(wall.correction_ns - OFF_NS) < 5 * MS
+    assert sync.word == ""
 
 
 def test_a_router_that_does_not_tell_the_time_for_long_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
