@@ -89,6 +89,9 @@ class Board:
     """Turned away from the target on purpose, to look along the way."""
     look_since_ns: int = 0
     """Since when it has faced that way."""
+    battery_known_ns: int | None = None
+    """When the vehicle last told the battery's share."""
+    battery_silence_told: bool = False
     around: Surroundings = field(default_factory=Surroundings)
     following: Following = field(default_factory=Following)
 
@@ -254,6 +257,8 @@ class Board:
             self.dt_s = min(max((inputs.now_ns - self.inputs.now_ns) / 1e9, 0.0), 0.2)
         self.inputs, self.correction, self.step_kind = inputs, None, Step.STALE
         self.claims.take(inputs.claims, inputs.now_ns)
+        if self.vehicle is not None and self.vehicle.battery_share is not None:
+            self.battery_known_ns = inputs.now_ns
         before = self.track.latest
         if inputs.pose is not None:
             self.step_kind = self.track.add(inputs.pose.message, inputs.pose.received_ns)

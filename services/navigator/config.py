@@ -111,6 +111,8 @@ class FailsafeConfig(BaseModel):
     battery_land_share: float = Field(default=0.20, ge=0.0, le=1.0)
     battery_next_share: float = Field(default=0.30, ge=0.0, le=1.0)
     """Below this no further tree is begun: return and land."""
+    battery_silent_s: float = Field(default=10.0, gt=0.0, le=300.0)
+    """A battery that was known in this flight and is not told any more for so long counts as one below that."""
     view_silent_s: float = Field(default=0.5, gt=0.0, le=5.0)
     """The live guard is blind when no depth image came for so long: nothing is flown at that it has not looked at."""
     obstacle_hold_s: float = Field(default=10.0, gt=0.0, le=300.0)

@@ -14,11 +14,12 @@ import numpy as np
 from schemas.navigation import MissionStateName
 from schemas.orders import CommandName
 from services.navigator.approaching import at_height
+from services.navigator.battery import fell_silent
 from services.navigator.board import Board
 from services.navigator.config import NavigatorConfig
-from services.navigator.failsafe import Fault, Watch
+from services.navigator.failsafe import AIRBORNE, Fault, Watch
 from services.navigator.orders import Verdict, carry_out
-from services.navigator.preflight import missing
+from services.navigator.preflight import missing, warnings
 from services.navigator.states import STATES
 from services.navigator.surroundings import START_COLUMN_M
 from services.navigator.telling import Telling
@@ -84,6 +85,7 @@ class Mission:
         self._adopt(inputs.now_ns)
         self.fault = self.watch.check(self.board, self.state, self._resume)
         self._answer(inputs.now_ns)
+        self._tell_battery(inputs.now_ns)
         intent = self._intent(inputs.now_ns)
         self._tell_waiting(intent.word, inputs.now_ns)
         self._move(intent)
@@ -231,6 +233,10 @@ class Mission:
             self.go(result, now_ns)
         return Intent("stop")
 
+    def _tell_battery(self, now_ns: int) -> None:
+        if self.state in AIRBORNE and (word := fell_silent(self.board)):
+            self._events.append(Event(now_ns, self.state, self.state, word))
+
     def _tell_waiting(self, word: str, now_ns: int) -> None:
         if word and word != self.reason:
             self._events.append(Event(now_ns, self.state, self.state, word))
@@ -259,7 +265,7 @@ class Mission:
         faults = missing(self.board, self.config)
         if not faults:
             self._prepare_flight()
-            self.go(Next("take_off", "preflight passed"), now_ns)
+            self.go(Next("take_off", "; ".join(["preflight passed", *warnings(self.board, self.config)])), now_ns)
         elif self._held_s(now_ns) > self.config.preflight_wait_s:
             self.go(Next("failed", f"preflight: {'; '.join(faults)}"), now_ns)
         else:

@@ -44,6 +44,13 @@ def missing(board: Board, config: NavigatorConfig) -> list[str]:
     return faults
 
 
+def warnings(board: Board, config: NavigatorConfig) -> list[str]:
+    """Return what the operator should know and what is no reason to stay: some vehicles have no gauge."""
+    v = board.vehicle
+    unknown = not config.handheld and v is not None and v.battery_share is None
+    return ["battery: the vehicle does not tell its share, watch the time"] if unknown else []
+
+
 def _unheard(board: Board, config: NavigatorConfig) -> Iterator[str]:
     """Yield which of the services that a mission needs say nothing; in memory none of them tells of itself."""
     heard = board.inputs.services

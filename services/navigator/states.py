@@ -21,6 +21,7 @@ from services.navigator.approaching import (
     gone,
     yaw_to_axis,
 )
+from services.navigator.battery import too_low_for_another, unknown_word
 from services.navigator.board import Board
 from services.navigator.claiming import home_goal, tree_goal
 from services.navigator.routing import route
@@ -128,7 +129,7 @@ def select(b: Board, since_s: float) -> Result:
     if here is None or since_s < c.select_settle_s:
         return Intent("stop")
     done = {*b.visited_ids, *b.given_up_ids}
-    if done and (low := _too_low_for_another(b)):
+    if low := too_low_for_another(b) if done else unknown_word(b):
         return _go_home(b, low)
     b.claims.wait_only_for({t.id for t in b.trees} - done)
     closed = done | b.claims.closed_ids
@@ -220,7 +221,7 @@ def docked(b: Board, since_s: float) -> Result:
     """Entry: docked. Exit: after dock.hold_s, more trees wanted -> undock; else return or landing."""
     seen = b.to_axis()
     if since_s >= b.config.dock.hold_s:
-        if b.docked_count < b.trees_wanted and (low := _too_low_for_another(b)):
+        if b.docked_count < b.trees_wanted and (low := too_low_for_another(b)):
             return _go_home(b, low)
         if b.docked_count < b.trees_wanted:
             return Next("undock", f"{b.docked_count} of {b.trees_wanted} trees done")
@@ -291,12 +292,6 @@ STATES: dict[MissionStateName, Callable[[Board, float], Result]] = {
     "take_off": take_off, "scan": scan, "select": select, "face": face, "approach": approach, "dock": dock,
     "docked": docked, "undock": undock, "return": return_home,
 }  # fmt: skip
-
-
-def _too_low_for_another(b: Board) -> str:
-    share = None if b.vehicle is None else b.vehicle.battery_share
-    low = share is not None and share < b.config.failsafe.battery_next_share
-    return f"battery at {100.0 * share:.0f} %: no further tree" if share is not None and low else ""
 
 
 def _go_home(b: Board, reason: str) -> Next:

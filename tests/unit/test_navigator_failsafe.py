@@ -246,6 +246,13 @@ def test_battery_low_lands() -> None:
     assert "battery" in world.mission.reason
 
 
+def test_a_battery_that_was_never_known_takes_off_and_that_is_told() -> None:
+    world = World(battery=None)
+    world.start()
+    assert world.run("scan", 60.0) == "scan"
+    assert any("preflight passed; battery" in event.reason for event in world.events)
+
+
 def test_low_battery_does_not_take_off() -> None:
     world = World(battery=0.3)
     world.start()

@@ -276,6 +276,35 @@ def test_who_arms_while_preflight_waits_has_the_aircraft() -> None:
 # -- the battery
 
 
+@pytest.mark.parametrize("state", ["scan", "docked"])
+def test_a_battery_that_is_not_known_any_more_sends_it_home(state: str) -> None:
+    """It was known in this flight: a power module that failed is no full battery."""
+    config = NavigatorConfig(return_home=True, trees_wanted=2)
+    world = World(config.model_copy(update={"dock": config.dock.model_copy(update={"hold_s": 12.0})}))
+    world.start()
+    assert world.run(state) == state
+    world.battery = None
+    assert world.run("return", 90.0) == "return", world.mission.reason
+    words = [event.reason for event in world.events]
+    assert sum("battery: no word for 10 s" in word for word in words) == 1, "told when it begins"
+    assert any("battery: no word for" in event.reason for event in world.events if event.after in ("return", "undock"))
+    assert world.run("landed", 120.0) == "landed"
+    assert world.mission.board.docked_count == int(state == "docked")
+
+
+@pytest.mark.parametrize("state", ["scan", "docked"])
+def test_a_battery_that_is_not_told_for_a_moment_changes_nothing(state: str) -> None:
+    world = World(NavigatorConfig(return_home=True, trees_wanted=2))
+    world.start()
+    assert world.run(state) == state
+    world.battery = None
+    world.run(seconds=9.0)
+    world.battery = 0.9
+    world.run("landed", 300.0)
+    assert world.mission.board.docked_count == 2
+    assert not any("battery" in event.reason for event in world.events)
+
+
 def test_too_little_for_another_tree_is_asked_also_after_one_that_was_given_up() -> None:
     world = World(NavigatorConfig(return_home=True), trees=[tree(1, 4.0, 1.0), tree(2, -3.0, 2.0)])
     world.start()

@@ -24,6 +24,7 @@ _RESULTS = {
 _FUSED_FLAGS = mav.ESTIMATOR_POS_HORIZ_REL | mav.ESTIMATOR_POS_HORIZ_ABS
 _AGREE_M, _AGREE_RAD, _AGREE_S = 0.4, math.radians(20.0), 0.5
 _FRESH_S = 1.0
+_BATTERY_FRESH_S = 5.0
 _STARTED_AGAIN_NS = 2_000_000_000
 
 
@@ -44,7 +45,8 @@ class Telemetry:
         self.mode_ns = 0
         """When the mode was last told."""
         self.landed: LandedState = "unknown"
-        self.battery_share: float | None = None
+        self._shares: dict[int, tuple[float | None, int]] = {}
+        """The battery's share by each message that tells it, None where it does not know it, and when it came."""
         self.R_map_body: Matrix | None = None
         self.position_m: Matrix | None = None
         self.velocity_m_s: Matrix | None = None
@@ -91,6 +93,7 @@ class Telemetry:
         """Forget what another start of the autopilot may have changed: streams, origin, acknowledgements."""
         self.outages += 1
         self.origin_known, self.estimator_flags, self.may_arm = False, None, None
+        self._shares.clear()
         self.acks.clear()
         self.came_ns.clear()
         self._agrees_since_ns = None
@@ -98,6 +101,14 @@ class Telemetry:
     def age_s(self, now_ns: int) -> float:
         """Return the seconds since the autopilot spoke, inf before."""
         return math.inf if self.heard_ns is None else (now_ns - self.heard_ns) / 1e9
+
+    def battery_share(self, now_ns: int) -> float | None:
+        """Return what is left in the battery; None when nobody has known it for a while: it is no full one."""
+        for message_id in (mav.MAVLINK_MSG_ID_SYS_STATUS, mav.MAVLINK_MSG_ID_BATTERY_STATUS):
+            share, came_ns = self._shares.get(message_id, (None, 0))
+            if share is not None and now_ns - came_ns <= _BATTERY_FRESH_S * 1e9:
+                return share
+        return None
 
     def agree(self, T_map_body: Matrix | None, now_ns: int) -> None:
         """Compare the autopilot's estimate with vision: fused is what follows it for a while."""
@@ -137,7 +148,7 @@ class Telemetry:
         return VehicleState(
             stamp_ns=now_ns, seq=seq, connected=connected, armed=self.armed, mode=self.mode, landed=self.landed,
             quaternion_map_body=_quaternion(self.R_map_body), position_map_m=_tuple(self.position_m),
-            velocity_map_m_s=_tuple(self.velocity_m_s), battery_share=self.battery_share,
+            velocity_map_m_s=_tuple(self.velocity_m_s), battery_share=self.battery_share(now_ns),
             vision_fused=self.fused(now_ns), operator_override=override, engaged_mission_id=mission_id,
             link_age_s=min(max(age, 0.0), 1e6), note=note[:500],
         )  # fmt: skip
@@ -159,18 +170,19 @@ class Telemetry:
     def _on_extended_sys_state(self, message: Any, _: int) -> None:  # noqa: ANN401
         self.landed = _LANDED.get(message.landed_state, "unknown")
 
-    def _on_sys_status(self, message: Any, _: int) -> None:  # noqa: ANN401
-        self._battery(message.battery_remaining)
+    def _on_sys_status(self, message: Any, received_ns: int) -> None:  # noqa: ANN401
+        self._battery(message, received_ns)
         check = mav.MAV_SYS_STATUS_PREARM_CHECK
         if message.onboard_control_sensors_enabled & check:
             self.may_arm = bool(message.onboard_control_sensors_health & check)
 
-    def _on_battery_status(self, message: Any, _: int) -> None:  # noqa: ANN401
-        self._battery(message.battery_remaining)
+    def _on_battery_status(self, message: Any, received_ns: int) -> None:  # noqa: ANN401
+        self._battery(message, received_ns)
 
-    def _battery(self, percent: int) -> None:
-        if 0 <= percent <= 100:
-            self.battery_share = percent / 100.0
+    def _battery(self, message: Any, received_ns: int) -> None:  # noqa: ANN401
+        percent = message.battery_remaining
+        share = percent / 100.0 if 0 <= percent <= 100 else None
+        self._shares[message.get_msgId()] = (share, received_ns)
 
     def _on_estimator_status(self, message: Any, _: int) -> None:  # noqa: ANN401
         self.estimator_flags = int(message.flags)
