@@ -73,6 +73,11 @@ class CameraConfig(BaseModel):
     """Depth of compressed frames, lossless. PNG takes six to fifteen times the processor time and is no smaller
     (fr1_desk: 9.4 ms and 113 KB against 1.7 ms and 94 KB)."""
 
+    @property
+    def real(self) -> bool:
+        """Whether it looks at the world now: neither simulated nor a recording."""
+        return self.source == "realsense"
+
     @field_validator("source")
     @classmethod
     def _known(cls, source: str) -> str:

@@ -90,6 +90,15 @@ class TreedockConfig(BaseModel):
             )
         return self
 
+    @property
+    def vehicle_guessed(self) -> bool:
+        """Whether a real camera looks and nobody said what the autopilot flies: the bridge then refuses to engage.
+
+        Not refused here: without an aircraft (a live view, in the hand, calibration) there is nothing to say.
+        """
+        second = self.fusion.enabled and self.fusion.second.enabled and self.fusion.second.camera.real
+        return (self.camera.real or second) and not self.autopilot.vehicle_said
+
 
 def load_config(file: Path | None = None) -> TreedockConfig:
     """Return the configuration from its usual places and ``file`` (of ``--config``).

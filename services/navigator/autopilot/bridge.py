@@ -35,6 +35,10 @@ _MODE_NS = 100_000_000
 """In flight the heartbeat is asked for this often, so that a pilot who takes over is noticed in 0.1 s instead of 1 s."""
 _ORIGINS, _ORIGIN_QUESTIONS = 30, 2
 _SET_THEM = "Set them, or start with --set autopilot.set_parameters=true; then start the autopilot again"
+_SAY_VEHICLE = (
+    "parameters: autopilot.vehicle is not said, and the camera is a real one. Set it to 'real' (the sticks must win), or to "
+    "'simulation' for hardware in the loop"
+)
 _AHEAD_S = 0.15
 """A setpoint is carried on along its velocity for at most this long after its guidance was made."""
 _USE_POSITION_VELOCITY_YAW_RATE = 448
@@ -44,8 +48,11 @@ _USE_POSITION_VELOCITY_YAW_RATE = 448
 class Bridge:
     """All the bridge knows. ``handle`` takes the autopilot's messages, ``tick`` gives ours."""
 
-    def __init__(self, config: AutopilotConfig, sensors: Sensors | None = None) -> None:
+    def __init__(
+        self, config: AutopilotConfig, sensors: Sensors | None = None, *, vehicle_guessed: bool = False
+    ) -> None:
         self.config = config
+        self._vehicle_guessed = vehicle_guessed
         self.sensors = sensors or Sensors()
         self.mount = Mount.level(config.camera_offset_m, config.camera_pitch_rad, config.camera_yaw_rad)
         self.telemetry = Telemetry(config.component_id)
@@ -131,8 +138,8 @@ class Bridge:
             out.append(px4.request(mav.MAVLINK_MSG_ID_HEARTBEAT, system))
         out.extend(self.clocks.due(now_ns))
         if self.config.check_parameters:
-            still = not self.telemetry.armed and not flying
-            out.extend(self.parameters.due(system, now_ns, may_set=still))
+            may_set = not (self.telemetry.armed or flying or self._vehicle_guessed)
+            out.extend(self.parameters.due(system, now_ns, may_set=may_set))
         odometry = self.vision.message(now_ns)
         if odometry is not None:
             out.append(odometry)
@@ -158,6 +165,8 @@ class Bridge:
 
     def refusal(self) -> str:
         """Return why the vehicle must not be flown, in words; empty when nothing speaks against it."""
+        if self._vehicle_guessed:
+            return _SAY_VEHICLE
         if not self.config.check_parameters:
             return ""
         if not self.parameters.complete:

@@ -17,7 +17,8 @@ class AutopilotConfig(BaseModel):
     connection: str = Field(default="udpin:127.0.0.1:14540", min_length=1)
     """``udpin:HOST:PORT``, ``udpout:HOST:PORT``, ``tcp:HOST:PORT`` or ``serial:DEVICE:BAUD``."""
     vehicle: Literal["simulation", "real"] = "simulation"
-    """Which parameters preflight asks for: on a real aircraft the sticks must win. To be said where a serial line leads there."""
+    """Which parameters preflight asks for: on a real aircraft the sticks must win. To be said where a serial line leads there,
+    and beside a real camera: the bridge engages nothing of which it is not known."""
     check_parameters: bool = True
     """Refuse to engage while a parameter that a flight rests on is not as it has to be."""
     set_parameters: bool = False
@@ -58,10 +59,15 @@ class AutopilotConfig(BaseModel):
     engage_timeout_s: float = Field(default=12.0, gt=0.0, le=300.0)
     """Patience with each of vision, mode and arming, asked for again and again: PX4's checks pass late after its start."""
 
+    @property
+    def vehicle_said(self) -> bool:
+        """Whether ``vehicle`` was set by somebody."""
+        return "vehicle" in self.model_fields_set
+
     @model_validator(mode="after")
     def _sticks_win(self) -> AutopilotConfig:
         """Refuse to guess what a serial line leads to: a real aircraft taken for a simulated one is asked to switch its sticks off."""
-        if self.connection.startswith("serial:") and "vehicle" not in self.model_fields_set:
+        if self.connection.startswith("serial:") and not self.vehicle_said:
             raise ValueError(
                 "autopilot.connection is a serial line: say autopilot.vehicle = 'real', or 'simulation' for hardware in the loop"
             )

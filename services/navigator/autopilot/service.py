@@ -24,14 +24,16 @@ class Autopilot:
     """Drives a bridge over a link."""
 
     def __init__(
-        self, context: Context, config: AutopilotConfig, link: Link, fusion: FusionConfig | None = None
-    ) -> None:
+        self, context: Context, config: AutopilotConfig, link: Link, fusion: FusionConfig | None = None, *,
+        vehicle_guessed: bool = False,
+    ) -> None:  # fmt: skip
         self._context = context
         self._link = link
         fusion = fusion or FusionConfig()
         self._fused = fusion.enabled
         imu_hz, gps_hz = fusion.imu_hz * fusion.imu, fusion.gps_hz * fusion.gps
-        self.bridge = Bridge(config, Sensors(imu_hz, gps_hz) if fusion.enabled else None)
+        sensors = Sensors(imu_hz, gps_hz) if fusion.enabled else None
+        self.bridge = Bridge(config, sensors, vehicle_guessed=vehicle_guessed)
         self._identified: int | None = None
         """The system as whose component we speak."""
         self._note = ""
@@ -127,4 +129,5 @@ def build(context: Context) -> None:
     on_stop = getattr(context, "on_stop", None)
     if on_stop is not None:
         on_stop(link.close)
-    Autopilot(context, config, link, context.config.fusion).register()
+    guessed = context.config.vehicle_guessed
+    Autopilot(context, config, link, context.config.fusion, vehicle_guessed=guessed).register()
