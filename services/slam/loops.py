@@ -20,6 +20,7 @@ from services.slam.match import keep_common_turn
 from services.slam.places import Bag, Places
 from services.slam.posegraph import Edges, expect_nodes, optimise
 from services.slam.tracking import MATCH_BLIND, Tracked, Tracking, moved
+from services.slam.verify import told_by_close
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
@@ -30,9 +31,8 @@ _NEAR_RAD = 0.6
 _CHECKS = 3
 """Candidates checked by geometry per keyframe."""
 _MIN_INLIERS = 45
-_MIN_CLOSE, _FOUND_LEAST = 20, 0.12
-"""Of a loop's matches so many have measured depth, and they are this share of what should be seen from there. True loops of
-a forest have 67 and 0.27 at least; a backdrop seen from two places two metres apart 85 matches, 4 of them close, and 0.07."""
+_FOUND_LEAST = 0.12
+"""A loop's matches are this share of what should be seen from there, and enough have measured depth. True loops of a forest have 67 and 0.27 at least; a backdrop seen from two places two metres apart 85 matches, 4 of them close, and 0.07."""
 _WINDOW_PX = 8.0
 _COVISIBLE = 15
 """Shared points that make two keyframes neighbours."""
@@ -254,8 +254,7 @@ def settles(found: Tracked) -> bool:
 
     What lies beyond the depth camera's range tells the direction alone: a place by such points is the candidate's own.
     """
-    close = np.count_nonzero((found.point >= 0) & (found.features.depth > 0.0) & ~found.features.far)
-    return found.inliers >= max(_MIN_INLIERS, _FOUND_LEAST * found.expected) and bool(close >= _MIN_CLOSE)
+    return found.inliers >= max(_MIN_INLIERS, _FOUND_LEAST * found.expected) and told_by_close(found)
 
 
 @njit(cache=True, nogil=True)

@@ -54,7 +54,7 @@ class Motion:
     def predict(self, stamp_ns: int) -> F64:
         """Return T_last_camera (4, 4) expected at a stamp."""
         dt_s = self.since_s(stamp_ns)
-        if dt_s > _KEEPS_S:
+        if self.stale(stamp_ns):
             return np.eye(4)
         return pose(exp_rotation(self._w_rad_s * dt_s), self._v_m_s * dt_s)
 
@@ -64,7 +64,7 @@ class Motion:
         Without ``T_last_camera`` that of the last step goes on; with it, that of this step goes on changing as it did.
         """
         dt_s = self.since_s(stamp_ns)
-        if dt_s > _KEEPS_S:
+        if self.stale(stamp_ns):
             return STILL
         if T_last_camera is None or dt_s < _LEAST_S:
             return Velocity(self._v_m_s, self._w_rad_s)
@@ -103,6 +103,10 @@ class Motion:
             self._w_rad_s = log_rotation(T_last_camera[:3, :3]) / dt_s
             self._sure, self._step_s = True, dt_s
         self._stamp_ns = stamp_ns
+
+    def stale(self, stamp_ns: int) -> bool:
+        """Return whether the last frame is so long ago that its velocity tells nothing of where the camera is now."""
+        return self.since_s(stamp_ns) > _KEEPS_S
 
     def since_s(self, stamp_ns: int) -> float:
         """Return the time since the last frame."""

@@ -74,6 +74,8 @@ class Slam:
         self._felt: tuple[int, F64 | None, F64 | None] | None = None
         """Stamp, specific force and the autopilot's up of the last frame, when it was located."""
         self._last: Tracked | None = None
+        self._was_lost = False
+        """No pose was found for the frame before."""
         self._motion = Motion()
         self.shutter = Shutter(self.atlas, camera)
         self._lag = Lag(intrinsics, camera, config, self._extractor.depth_noise)
@@ -186,7 +188,8 @@ class Slam:
         self._unroll(joined[0], velocity)
         movers.mark(self.tracking, last, joined[0], self._motion.since_s(stamp_ns))
         believed = self._motion.plausible(stamp_ns, step_between(last, joined[0]))
-        return joined[0] if believed and self._verifier.believes(joined[0], depth_m, blind=False) else None
+        blind = self._was_lost or self._motion.stale(stamp_ns)
+        return joined[0] if believed and self._verifier.believes(joined[0], depth_m, blind=blind) else None
 
     def _place(self, features: Features, velocity: Velocity) -> None:
         """Put features where and as far away as they were at the frame's moment."""
@@ -250,7 +253,7 @@ class Slam:
         if self._rule.wants(stamp_ns, frame, self.crew.waiting) or self.graph_version == 0:
             new, graph = self._make_keyframe(frame, graph)
         self._set_anchor(frame)
-        self._last = frame
+        self._last, self._was_lost = frame, False
         if self._rest.begins(stamp_ns, made=bool(new)):
             self.crew.submit(self.mapping.adjust_all)
         if self._trail is not None:
@@ -325,6 +328,7 @@ class Slam:
             return self._catch_up()
 
     def _lost(self, stamp_ns: int, graph: GraphUpdate | None) -> TrackResult:
+        self._was_lost = True
         return self._result(stamp_ns, "relocalising" if self._taken_up else "lost", None, [], graph)
 
     def _graph(self, reason: GraphReason) -> GraphUpdate:

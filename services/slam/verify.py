@@ -23,6 +23,8 @@ _FEW = 60
 _FOUND_LEAST = 0.08
 _FOUND_LEAST_BLIND = 0.12
 """Share of the points that should be seen that are found, where fewer than ``_FEW`` are."""
+_CLOSE_LEAST = 20
+"""Matches with measured depth that a place needs that is found blind, or by a loop: those beyond the range tell the direction alone."""
 _SURE_INLIERS = 100
 _SURE_FOUND = 0.25
 """A place found blind with so many is believed at once."""
@@ -35,7 +37,9 @@ class Verifier:
         self._camera, self._distortion = camera.array, distortion_of(intrinsics)
 
     def believes(self, frame: Tracked, depth_m: NDArray[np.float32], *, blind: bool) -> bool:
-        """Return whether a pose is fit to be published; ``blind``: found without a last frame to begin from."""
+        """Return whether a pose is fit to be published; ``blind``: found without a last frame, just before, to begin from."""
+        if blind and not told_by_close(frame):
+            return False
         if blind or frame.inliers < _FEW:
             least = _FOUND_LEAST_BLIND if blind else _FOUND_LEAST
             if frame.inliers < least * frame.expected:
@@ -53,6 +57,12 @@ class Verifier:
     def sure(frame: Tracked) -> bool:
         """Return whether a place found blind needs no second frame that says the same."""
         return frame.inliers >= _SURE_INLIERS and frame.inliers >= _SURE_FOUND * frame.expected
+
+
+def told_by_close(frame: Tracked) -> bool:
+    """Return whether enough matches have measured depth to tell a place by."""
+    close = (frame.point >= 0) & (frame.features.depth > 0.0) & ~frame.features.far
+    return bool(np.count_nonzero(close) >= _CLOSE_LEAST)
 
 
 @njit(cache=True, nogil=True)

@@ -26,7 +26,8 @@ def _walls() -> NDArray[np.uint8]:
 
 
 @cache
-def _rays() -> F64:
+def rays() -> F64:
+    """Return (H * W, 3) where each pixel looks in the camera's axes, z = 1."""
     i = INTRINSICS
     u, v = np.meshgrid(np.arange(i.width), np.arange(i.height))
     return np.stack([(u - i.cx) / i.fx, (v - i.cy) / i.fy, np.ones(u.shape)], axis=-1).reshape(-1, 3)
@@ -34,8 +35,8 @@ def _rays() -> F64:
 
 def look(T_world_camera: F64, rows: slice = slice(None)) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Return ``rows`` of grey (H, W) and depth (H, W), metres, seen from a pose inside the room (centre at the origin)."""
-    rays = _rays().reshape(INTRINSICS.height, INTRINSICS.width, 3)[rows].reshape(-1, 3)
-    d = rays @ T_world_camera[:3, :3].T
+    seen_along = rays().reshape(INTRINSICS.height, INTRINSICS.width, 3)[rows].reshape(-1, 3)
+    d = seen_along @ T_world_camera[:3, :3].T
     o = T_world_camera[:3, 3]
     with np.errstate(divide="ignore"):
         reach = (np.where(d > 0.0, _HALF_M, -_HALF_M) - o) / d
