@@ -32,6 +32,8 @@ _AROUND_PX = 3
 _ALIKE = 0.1
 """Share of its depth by which a pixel may differ from one beside it on the same surface."""
 _VOID_PX = 16
+_EMPTY_SHARE = 0.03
+"""A depth image with depth in fewer of its pixels is a fault, or a view that shows nothing: what has no depth there may be anywhere."""
 
 
 @dataclass(slots=True)
@@ -93,12 +95,13 @@ def sample_depth(
     """
     height, width = depth_m.shape
     out, info, far = np.zeros(len(xy)), np.zeros(len(xy)), np.zeros(len(xy), np.bool_)
+    empty = is_empty(depth_m)
     for i in range(len(xy)):
         c, r = int(xy[i, 0] + 0.5), int(xy[i, 1] + 0.5)
         if c <= _AROUND_PX or r <= _AROUND_PX or c >= width - _AROUND_PX - 1 or r >= height - _AROUND_PX - 1:
             continue
         z = depth_m[r, c]
-        if z <= 0.0:
+        if z <= 0.0 and not empty:
             far[i] = is_void(depth_m, c, r)
         if z < low_m or z > high_m or alone(depth_m, c, r):
             continue
@@ -123,6 +126,13 @@ def alone(depth_m: NDArray[np.float32], c: int, r: int) -> bool:
         for x in range(c - 1, c + 2):
             alike += abs(depth_m[y, x] - z) < _ALIKE * z
     return alike < 3
+
+
+@njit(cache=True, nogil=True)
+def is_empty(depth_m: NDArray[np.float32]) -> bool:
+    """Return whether hardly a pixel has depth (every eighth is asked, in both directions)."""
+    asked = depth_m[4::8, 4::8]
+    return bool(np.count_nonzero(asked > 0.0) < _EMPTY_SHARE * asked.size)
 
 
 @njit(cache=True, nogil=True)
