@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 F64 = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
-_OFF_PX, _LEAST = 4.0, 10
+_OFF_PX, LEAST = 4.0, 10
 """An inlier is at most so far off, and so many make a pose."""
 
 
@@ -20,7 +20,7 @@ def ransac(world: F64, uv: F64, camera: F64) -> tuple[F64, F64, Bool] | None:
     """
     import cv2
 
-    if len(world) < _LEAST:
+    if len(world) < LEAST:
         return None
     K = np.array([[camera[0], 0.0, camera[2]], [0.0, camera[1], camera[3]], [0.0, 0.0, 1.0]])
     cv2.setRNGSeed(1)
@@ -28,7 +28,7 @@ def ransac(world: F64, uv: F64, camera: F64) -> tuple[F64, F64, Bool] | None:
         np.ascontiguousarray(world), np.ascontiguousarray(uv), K, None,
         iterationsCount=300, reprojectionError=_OFF_PX, confidence=0.9999, flags=cv2.SOLVEPNP_AP3P,
     )  # fmt: skip
-    if not ok or len(inliers) < _LEAST:
+    if not ok or len(inliers) < LEAST:
         return None
     R: F64 = np.ascontiguousarray(cv2.Rodrigues(r)[0], np.float64)
     t: F64 = np.ascontiguousarray(t_column[:, 0], np.float64)
@@ -37,4 +37,4 @@ def ransac(world: F64, uv: F64, camera: F64) -> tuple[F64, F64, Bool] | None:
     agree = np.zeros(len(world), np.bool_)
     agree[inliers[:, 0]] = True
     agree &= (X[:, 2] > 0.0) & (off < 2.0 * _OFF_PX)
-    return (R, t, agree) if np.count_nonzero(agree) >= _LEAST else None
+    return (R, t, agree) if np.count_nonzero(agree) >= LEAST else None

@@ -31,7 +31,11 @@ class Relocation:
     def find(self, stamp_ns: int, features: Features, depth_m: NDArray[np.float32]) -> Tracked | None:
         """Return the frame located anywhere in the map, None when it is not, or not believed yet; ``depth_m`` (H, W)."""
         frame = self._loops.relocate(features)
-        if frame is None or not self._known(frame) or not self._verifier.believes(frame, depth_m, blind=True):
+        if (
+            frame is None
+            or position_sigma_m(frame) > _SIGMA_MOST_M
+            or not self._verifier.believes(frame, depth_m, blind=True)
+        ):
             self._found = None
             return None
         before, self._found = self._found, (stamp_ns, frame)
@@ -40,10 +44,6 @@ class Relocation:
             return None
         self._found = None
         return frame
-
-    @staticmethod
-    def _known(frame: Tracked) -> bool:
-        return position_sigma_m(frame) <= _SIGMA_MOST_M
 
 
 def position_sigma_m(frame: Tracked) -> float:

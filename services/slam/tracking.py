@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from services.slam.atlas import Atlas, neighbours
 from services.slam.binary import match_all
-from services.slam.blind import ransac
+from services.slam.blind import LEAST, ransac
 from services.slam.camera import CameraModel
 from services.slam.config import SlamConfig
 from services.slam.far import FarPrior
@@ -193,19 +193,20 @@ class Tracking:
     ) -> Tracked | None:
         """Locate a frame without any prior from 3D-2D matches (query -> feature): AP3P in RANSAC, then refinement."""
         queries = np.flatnonzero(match >= 0)
-        measured = queries[self._measured(known[queries])]
-        for chosen in (measured, queries):  # far ones only where there are too few others
-            found = ransac(world[chosen], features.uv[match[chosen]], self.camera.array)
-            if found is not None:
-                R, t, agree = found
-                kept = np.full_like(match, -1)
-                kept[chosen[agree]] = match[chosen[agree]]
-                return self._locate(features, R, t, world, kept, known, last)
-        return None
+        measured = queries[self._measured(known, last)[queries]]
+        chosen = measured if len(measured) >= LEAST else queries  # far ones only where there are too few others
+        found = ransac(world[chosen], features.uv[match[chosen]], self.camera.array)
+        if found is None:
+            return None
+        R, t, agree = found
+        kept = np.full_like(match, -1)
+        kept[chosen[agree]] = match[chosen[agree]]
+        return self._locate(features, R, t, world, kept, known, last)
 
-    def _measured(self, known: I32) -> Bool:
-        """Return which of map points ``known`` (-1: temporary, taken as measured) have measured depth."""
-        return (known < 0) | (self.atlas.points.parallax[known] < 0.0)
+    def _measured(self, known: I32, last: Tracked | None) -> Bool:
+        """Return which of map points ``known``, or (-1) temporary ones of the ``last`` frame, have measured depth."""
+        measured = self.atlas.points.parallax[known] < 0.0
+        return np.where(known < 0, last is None or ~last.features.far, measured)
 
     def again(self, frame: Tracked) -> None:
         """Refine a frame's pose by the points it sees, in place, after its features were moved."""

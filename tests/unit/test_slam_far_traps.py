@@ -116,3 +116,12 @@ def test_a_lost_camera_finds_no_place_by_far_points_alone(
     place = slam.loops.place
     monkeypatch.setattr(slam.loops, "place", lambda f, slot: (got := place(f, slot)) and with_close(got, close))
     assert (relocation.find(10**12, *seen) is not None) is found
+
+
+def test_far_temporary_points_are_not_measured(lost: tuple) -> None:
+    slam, _, _ = lost
+    last = slam._last
+    far = last.features.far
+    far[:40] = True
+    known = np.full(len(far), -1, np.int32)
+    np.testing.assert_array_equal(slam.tracking._measured(known, last), ~far)
