@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -236,8 +237,8 @@ class Loops:
             t_i - np.einsum("nab,nb->na", R_ij, t_j), weight,
         )  # fmt: skip
 
-    def relocate(self, features: Features) -> Tracked | None:
-        """Find a lost frame's place among all keyframes; None when nothing fits well."""
+    def relocate(self, features: Features) -> Iterator[Tracked]:
+        """Find places of a lost frame among all keyframes, the most alike first, each one when it is asked for."""
         kf = self.atlas.keyframes
         scores = self.places.scores(self.places.vocabulary.bag(features.desc))
         order = sorted(scores, key=lambda serial: (-scores[serial], -serial))[:5]
@@ -245,8 +246,7 @@ class Loops:
             slot = self.atlas.slot_of(serial)
             found = self.place(features, slot) if slot >= 0 and kf.n[slot] > 0 else None
             if found is not None and found.inliers >= _MIN_INLIERS:
-                return found
-        return None
+                yield found
 
 
 def settles(found: Tracked) -> bool:

@@ -254,6 +254,7 @@ class Slam:
             new, graph = self._make_keyframe(frame, graph)
         self._set_anchor(frame)
         self._last, self._was_lost = frame, False
+        self._relocation.forget()
         if self._rest.begins(stamp_ns, made=bool(new)):
             self.crew.submit(self.mapping.adjust_all)
         if self._trail is not None:

@@ -103,7 +103,7 @@ def _warm_loop(slam: Slam) -> None:
     """Close a loop of the scene with itself, and relocate in it."""
     slots = slam.atlas.slots
     features = slam.atlas.features_of(int(slots[-1]))
-    slam.loops.relocate(features)
+    list(slam.loops.relocate(features))
     found = slam.loops.place(features, int(slots[0]))
     if found is not None:
         slam.loops.close(int(slots[-1]), int(slots[0]), found, slam.mapping.turned)

@@ -81,7 +81,7 @@ def test_a_place_known_to_kilometres_is_none(monkeypatch: pytest.MonkeyPatch) ->
         None,
         good.expected,
     )
-    monkeypatch.setattr(slam.loops, "relocate", lambda _: vague)
+    monkeypatch.setattr(slam.loops, "relocate", lambda _: iter([vague]))
     assert position_sigma_m(vague) > 1000.0
     assert relocation.find(10**12 + 1, features, depth_m) is None
     assert relocation.find(10**12 + 2, features, depth_m) is None, "nor when a second frame says the same"

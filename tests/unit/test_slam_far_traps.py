@@ -125,3 +125,44 @@ def test_far_temporary_points_are_not_measured(lost: tuple) -> None:
     far[:40] = True
     known = np.full(len(far), -1, np.int32)
     np.testing.assert_array_equal(slam.tracking._measured(known, last), ~far)
+
+
+def unsure(frame: Tracked, off_m: float) -> Tracked:
+    return replace(frame, t=frame.t + np.array([off_m, 0.0, 0.0]), inliers=60, expected=100, place=None)
+
+
+def test_a_first_sight_vouches_for_half_a_second(lost: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
+    slam, relocation, seen = lost
+    good = slam.loops.place(seen[0], int(slam.atlas.slots[-1]))
+
+    def find(at_s: float, off_m: float) -> bool:
+        monkeypatch.setattr(slam.loops, "place", lambda *_: unsure(good, off_m))
+        return relocation.find(round(at_s * S_NS), *seen) is not None
+
+    assert not find(1000.0, 0.0)
+    assert not find(1060.0, 40.0), "a minute later it may be 40 m off"
+    assert find(1060.4, 40.0)
+    assert not find(1061.0, 40.0)
+    relocation.forget()
+    assert not find(1061.2, 40.0), "the camera was located meanwhile"
+
+
+def test_a_located_frame_ends_what_a_lost_one_saw(lost: tuple) -> None:
+    slam, _, _ = lost
+    slam._relocation._found = (0, slam._last)
+    assert slam.track(14 * PERIOD_NS, *look(turn_on_the_spot(14, 60.0)[-1])).status == "tracking"
+    assert slam._relocation._found is None
+
+
+def test_a_place_that_is_not_believed_hides_no_other(lost: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
+    slam, relocation, seen = lost
+    place, tried = slam.loops.place, []
+
+    def vague_at_first(features: object, slot: int) -> Tracked | None:
+        tried.append(slot)
+        found = place(features, slot)
+        return found if len(tried) > 1 or found is None else replace(found, information=found.information * 1e-8)
+
+    monkeypatch.setattr(slam.loops, "place", vague_at_first)
+    assert relocation.find(10**12, *seen) is not None
+    assert len(tried) > 1
