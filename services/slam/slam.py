@@ -40,7 +40,7 @@ from services.slam.worker import Crew, Inline
 F64 = NDArray[np.float64]
 
 _MIN_START_POINTS = 100
-"""Features with depth that a first keyframe needs."""
+"""Features with depth that makes map points that a first keyframe needs."""
 _JUMP_M = 0.01
 _JUMP_RAD = 0.005
 """A loop that moves the camera by more is told as a jump."""
@@ -133,7 +133,8 @@ class Slam:
     def _initialise(
         self, stamp_ns: int, features: Features, depth_m: NDArray[np.float32], accel: F64 | None, attitude: F64 | None
     ) -> TrackResult:
-        if np.count_nonzero(features.depth > 0.0) < _MIN_START_POINTS:
+        makes_point = (features.depth >= self.config.min_depth_m) & (features.depth <= self.config.max_depth_m)
+        if np.count_nonzero(makes_point) < _MIN_START_POINTS:
             return self._result(stamp_ns, "initialising", None, [], None)
         up = self._upright.begin(accel, attitude, lambda: ground_up(depth_m, self.intrinsics))
         T_camera_map = inverse(gravity.first_pose(up))

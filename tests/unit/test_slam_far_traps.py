@@ -14,7 +14,7 @@ from services.slam.relocation import Relocation
 from services.slam.results import TrackResult
 from services.slam.slam import Slam
 from services.slam.tracking import Tracked
-from tests.unit.slam_backdrop import CLOSED, OPEN
+from tests.unit.slam_backdrop import BEYOND_MAP, CLOSED, OPEN
 from tests.unit.slam_backdrop import look as look_out
 from tests.unit.slam_room import INTRINSICS, look, turn_on_the_spot
 from tests.unit.test_slam_runaway import CONFIG
@@ -86,6 +86,12 @@ def test_a_view_into_the_open_has_far_points() -> None:
     watched.see(sway(0), OPEN)
     assert watched.slam._last is not None
     assert np.count_nonzero(watched.slam._last.features.far) > 100
+
+
+def test_a_map_begins_with_depth_that_makes_points() -> None:
+    watched = Watched()
+    results = [watched.see(sway(k), BEYOND_MAP, reach_m=12.0) for k in range(3)]
+    assert [r.status for r in results] == ["initialising"] * 3
 
 
 @pytest.fixture
