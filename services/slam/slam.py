@@ -182,15 +182,21 @@ class Slam:
         velocity = self._motion.velocity(stamp_ns, step_between(last, frame))
         self._place(features, velocity)
         joined = self.tracking.join_map(frame, unsure=last.features.smeared)
-        if joined is None or joined[0].inliers < self.config.min_inliers:
+        if joined is None or not self._enough(joined[0]):
             return None
-        if self.shutter.learn(joined[0]):
+        frame = joined[0]
+        if self.shutter.learn(frame):
             self.mapping.owe()
-        self._unroll(joined[0], velocity)
-        movers.mark(self.tracking, last, joined[0], self._motion.since_s(stamp_ns))
-        believed = self._motion.plausible(stamp_ns, step_between(last, joined[0]))
+        self._unroll(frame, velocity)
+        movers.mark(self.tracking, last, frame, self._motion.since_s(stamp_ns))
+        believed = self._enough(frame) and self._motion.plausible(stamp_ns, step_between(last, frame))
         blind = self._was_lost or self._motion.stale(stamp_ns)
-        return joined[0] if believed and self._verifier.believes(joined[0], depth_m, blind=blind) else None
+        return frame if believed and self._verifier.believes(frame, depth_m, blind=blind) else None
+
+    def _enough(self, frame: Tracked) -> bool:
+        """Return whether so many matches of the map are left that they tell a pose."""
+        left = min(frame.inliers, int(np.count_nonzero(frame.point >= 0)))
+        return left >= self.config.min_inliers
 
     def _place(self, features: Features, velocity: Velocity) -> None:
         """Put features where and as far away as they were at the frame's moment."""

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from services.common.geometry import inverse, level_camera
+from services.slam import movers
 from services.slam.config import SlamConfig
 from services.slam.relocation import Relocation
 from services.slam.results import TrackResult
@@ -172,3 +173,15 @@ def test_a_place_that_is_not_believed_hides_no_other(lost: tuple, monkeypatch: p
     monkeypatch.setattr(slam.loops, "place", vague_at_first)
     assert relocation.find(10**12, *seen) is not None
     assert len(tried) > 1
+
+
+def test_what_moves_may_leave_too_few_matches_for_a_pose(lost: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
+    slam, _, _ = lost
+
+    def take_most(_: object, __: Tracked, frame: Tracked, ___: float) -> None:
+        frame.point[np.flatnonzero(frame.point >= 0)[24:]] = -1
+        frame.inliers = frame.expected = 24
+
+    monkeypatch.setattr(movers, "mark", take_most)
+    monkeypatch.setattr(slam._relocation, "find", lambda *_: None)
+    assert slam.track(14 * PERIOD_NS, *look(turn_on_the_spot(14, 60.0)[-1])).status == "lost"
