@@ -267,9 +267,14 @@ def fit(turns: F64, means: F64) -> Vertical:
     return Vertical(up, math.sqrt(worst) / STANDARD_M_S2, x[3:])
 
 
-def levelling(up_map: F64, forward_map: F64) -> F64:
-    """Return the rotation (3, 3) of the map that makes ``up_map`` z while the heading of ``forward_map`` stays along x."""
+def levelling(up_map: F64, forward_map: F64 | None) -> F64:
+    """Return the rotation (3, 3) of the map that makes ``up_map`` z while the heading of ``forward_map`` stays along x.
+
+    None: nothing is known to look along x, and the least rotation is it.
+    """
     R = rotation_aligning(up_map, [0.0, 0.0, 1.0])
+    if forward_map is None:
+        return R
     forward = R @ forward_map
     if math.hypot(forward[0], forward[1]) < math.sin(math.radians(2.0)):
         return R

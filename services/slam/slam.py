@@ -219,13 +219,18 @@ class Slam:
         up = self._upright.feel(stamp_ns, self._reference, self._anchor, accel, attitude, self.mapping.keyframe_pose)
         if up is None:
             return None
-        R = gravity.levelling(up, self.atlas.keyframes.R[self.atlas.slots[0], 2])
+        R = gravity.levelling(up, self._first_forward())
         self.mapping.turn(R)
         if self._last is not None:
             self._last.R = np.ascontiguousarray(self._last.R @ R.T)
         self._count_reset()
         self.graph_version += 1
         return self._graph("full_ba")
+
+    def _first_forward(self) -> F64 | None:
+        """Return where the map's first keyframe looks, (3,), None where it is lost: the map's x is its heading."""
+        kf, first = self.atlas.keyframes, self.atlas.slots[0]
+        return kf.R[first, 2] if kf.serial[first] == 0 else None
 
     @property
     def up_sigma_rad(self) -> float:

@@ -185,3 +185,35 @@ def test_what_moves_may_leave_too_few_matches_for_a_pose(lost: tuple, monkeypatc
     monkeypatch.setattr(movers, "mark", take_most)
     monkeypatch.setattr(slam._relocation, "find", lambda *_: None)
     assert slam.track(14 * PERIOD_NS, *look(turn_on_the_spot(14, 60.0)[-1])).status == "lost"
+
+
+def test_the_frame_that_sees_a_loops_adjustment_sees_the_loop(lost: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A frame between the adjustment and the end of the loop's job found no reason for its jump."""
+    slam, _, _ = lost
+    mapping, loops, told = slam.mapping, slam.loops, []
+    adjust_all, pay, before = mapping.adjust_all, mapping.pay, loops.closed
+
+    def adjusting(k: int) -> None:
+        told.append(loops.closed)
+        adjust_all(k)
+
+    def paying(k: int) -> None:
+        told.append(loops.closed)
+        pay(k)
+
+    monkeypatch.setattr(mapping, "adjust_all", adjusting)
+    monkeypatch.setattr(mapping, "pay", paying)
+    first, last = int(slam.atlas.slots[-3]), int(slam.atlas.slots[-1])
+    found = loops.place(slam.atlas.features_of(last), first)
+    assert found is not None
+    loops.close(last, first, found, mapping.turned)
+    assert told == [before + 2] * 2
+    assert loops.closed == before + 2
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_only_the_first_keyframe_looks_along_the_maps_x(first: bool, lost: tuple) -> None:
+    slam, _, _ = lost
+    if not first:
+        slam.atlas.keyframes.serial[slam.atlas.slots[0]] = 77
+    assert (slam._first_forward() is not None) is first

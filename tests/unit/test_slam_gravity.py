@@ -127,6 +127,15 @@ def test_an_upright_map_is_left_alone_and_becomes_sure() -> None:
 CAMERA = Intrinsics(width=320, height=240, fx=250.0, fy=250.0, cx=159.5, cy=119.5)
 
 
+def test_a_map_without_its_first_keyframe_is_not_turned_about_the_vertical() -> None:
+    """Its x is the first keyframe's heading; that of another is not along x."""
+    up, forward = exp_rotation([0.02, 0.01, 0.0])[2], np.array([0.0, 1.0, 0.0])
+    assert abs(np.arctan2(*gravity.levelling(up, forward)[[1, 0], 0])) > 1.5
+    R = gravity.levelling(up, None)
+    np.testing.assert_allclose(R @ up, [0.0, 0.0, 1.0], atol=1e-9)
+    assert abs(np.arctan2(R[1, 0], R[0, 0])) < 1e-3
+
+
 def plane_seen(up: F64, height_m: float) -> NDArray[np.float32]:
     """Depth (240, 320) of a plane ``height_m`` below a camera for which up is ``up``; 1 cm of noise."""
     u, v = np.meshgrid(np.arange(320), np.arange(240))
