@@ -191,7 +191,8 @@ def _of_the_same_map(log: Log, whole: Arrays) -> Arrays:
 def _restore(log: Log, whole: Arrays, slam: Slam) -> str:
     """Put the map together; return why that failed, or an empty text."""
     keyframes = log.keyframes
-    era, version, resets, _, newest = (int(x) for x in whole["numbers"]) if whole else (0, 0, 0, 0, -1)
+    numbers = whole["numbers"] if whole else (max(k.era for k in keyframes), 0, 0, 0, -1)
+    era, version, resets, _, newest = (int(x) for x in numbers)
     by_serial = {k.serial: k for k in keyframes}
     placed = _restore_whole(slam, whole, by_serial) if whole else 0
     later = [k for s, k in sorted(by_serial.items()) if s > newest and k.era == era]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -286,3 +287,19 @@ def test_a_disk_that_refuses_is_told_and_slam_goes_on(tmp_path: Path) -> None:
     maps.end()
     assert result.status == "tracking"
     assert "new map" in health.notes["map on disk"]
+
+
+def test_without_the_whole_map_the_last_eras_keyframes_are_its(tmp_path: Path) -> None:
+    """Of before a turn or a loop none fits those after it; the map was put together from those before any alone."""
+    kept_map(tmp_path)
+    (tmp_path / "map.npz").unlink(missing_ok=True)
+    store = Store(tmp_path, MOST)
+    log = store.read()
+    assert log.header is not None
+    store.begin(log.header)
+    for k in log.keyframes:
+        store.append(KEYFRAME, encode_keyframe(replace(k, era=2 if k.serial >= 2 else 1)))
+    slam, why_not = taken_up(tmp_path)
+    assert not why_not
+    assert slam.era == 2
+    assert set(slam.keyframe_poses()) == {k.serial for k in log.keyframes if k.serial >= 2}
