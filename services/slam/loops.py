@@ -164,11 +164,11 @@ class Loops:
         self._correct_poses(k, candidate, found, turned)
         with mapping.step():
             join_loop(atlas.points, atlas.keyframes, k, found.point, atlas.scales)
+            self.closed += 1  # before the adjustment: the frame that first sees its revision has to see why
         for s in own:
             mapping.fuse_into(int(s), old_points)
         mapping.adjust_all(k)
         mapping.pay(k)
-        self.closed += 1
         return Correction(jump_m, jump_rad)
 
     def _correct_poses(self, k: int, candidate: int, found: Tracked, turned: F64) -> None:
