@@ -18,6 +18,8 @@ LOG = logging.getLogger(__name__)
 
 _ABOUT = "map"
 _TELL_NS = 10_000_000_000
+_PAUSE_NS = 1_000_000_000
+"""Frames farther apart have a pause between them, in which nobody looked for a place."""
 
 
 class Book(Protocol):
@@ -64,7 +66,9 @@ class LiveMaps:
         self._store = None if folder is None else Store(folder, round(config.map_file_mb * 1e6))
         self._keeper: Keeper | None = None
         self._since_ns: int | None = None
-        """Since when there is no pose."""
+        """Since when there is no pose, pauses left out."""
+        self._stamp_ns: int | None = None
+        """Of the last frame."""
         self._tell_until_ns = 0
 
     def begin(self, intrinsics: Intrinsics, stamp_ns: int) -> Slam:
@@ -111,12 +115,14 @@ class LiveMaps:
 
     def after(self, slam: Slam, result: TrackResult) -> Slam:
         """Return the map for the next frame: another when this one has been of no use for too long."""
+        pause_ns = 0 if self._stamp_ns is None else max(result.stamp_ns - self._stamp_ns - _PAUSE_NS, 0)
+        self._stamp_ns = result.stamp_ns
         if result.status == "tracking":
             self._since_ns = None
             if self._tell_until_ns < result.stamp_ns:
                 self._tell("")
         elif result.status in {"lost", "relocalising"}:
-            self._since_ns = result.stamp_ns if self._since_ns is None else self._since_ns
+            self._since_ns = result.stamp_ns if self._since_ns is None else self._since_ns + pause_ns
             limit_s = self._config.new_map_after_s if result.status == "lost" else self._config.relocalise_within_s
             if result.stamp_ns - self._since_ns >= limit_s * 1e9:
                 return self._give_up(slam, result, limit_s)

@@ -16,6 +16,7 @@ from services.slam import keeper as keeping
 from services.slam.config import SlamConfig
 from services.slam.keeper import Keeper, take_up
 from services.slam.maps import LiveMaps
+from services.slam.results import TrackResult
 from services.slam.slam import Slam
 from services.slam.store import (
     BEAT,
@@ -303,3 +304,18 @@ def test_without_the_whole_map_the_last_eras_keyframes_are_its(tmp_path: Path) -
     assert not why_not
     assert slam.era == 2
     assert set(slam.keyframe_poses()) == {k.serial for k in log.keyframes if k.serial >= 2}
+
+
+def lost_at(stamp_ns: int) -> TrackResult:
+    return TrackResult(stamp_ns, "lost", None, None, None, None, [], None, 0, 1, 0, 0.1)
+
+
+def test_a_pause_is_no_search() -> None:
+    """A map is given up for 30 s without a place found, not for one frame before a pause of a minute and one after."""
+    maps = LiveMaps(CONFIG, None, HealthBook())
+    slam = maps.begin(INTRINSICS, 10**12)
+    assert maps.after(slam, lost_at(10**12)) is slam
+    assert maps.after(slam, lost_at(10**12 + 60 * 10**9)) is slam
+    given_up = [maps.after(slam, lost_at(10**12 + 60 * 10**9 + k * 10**8)) is not slam for k in range(1, 291)]
+    maps.end()
+    assert given_up == [False] * 289 + [True]
