@@ -71,13 +71,15 @@ def test_depth_confirms_sees_through_or_is_in_front(depth: float, index: int | N
     np.testing.assert_array_equal(counts, expected)
 
 
-def tracked(inliers: int, expected: int, place: F64) -> Tracked:
-    none = np.zeros(0)
+def tracked(inliers: int, expected: int, place: F64, close: int = 20) -> Tracked:
+    """Return a frame with so many matches that have measured depth."""
+    ones, none = np.ones(close), np.zeros(0, np.int32)
     features = Features(
-        np.zeros((0, 2)), none.astype(np.int32), none, np.zeros((0, 4), np.uint64), none, none, none.astype(bool), none,
-        none.astype(np.int32), none.astype(np.int32),
+        np.zeros((close, 2)), np.zeros(close, np.int32), 0.0 * ones, np.zeros((close, 4), np.uint64), 2.0 * ones, ones,
+        np.zeros(close, bool), ones, none, none,
     )  # fmt: skip
-    return Tracked(features, np.eye(3), np.zeros(3), none.astype(np.int32), inliers, None, 0.0, place, expected)
+    point = np.arange(close, dtype=np.int32)
+    return Tracked(features, np.eye(3), np.zeros(3), point, inliers, None, 0.0, place, expected)
 
 
 def test_a_view_that_depth_sees_through_is_not_believed() -> None:
@@ -89,6 +91,8 @@ def test_a_view_that_depth_sees_through_is_not_believed() -> None:
     assert verifier.believes(tracked(200, 300, place), depth_m, blind=True)
     assert not verifier.believes(tracked(200, 300, place), 3.0 * depth_m, blind=False)
     assert not verifier.believes(tracked(46, 900, place), depth_m, blind=True)
+    assert not verifier.believes(tracked(200, 300, place, close=19), depth_m, blind=True)
+    assert verifier.believes(tracked(200, 300, place, close=19), depth_m, blind=False)
     assert verifier.sure(tracked(200, 300, place))
     assert not verifier.sure(tracked(60, 100, place))
 
