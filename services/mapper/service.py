@@ -41,6 +41,9 @@ _FARTHEST_M = 5_000.0
 """From the map's origin: no aircraft was there, and the ground between would need a terabyte."""
 _HOLD_S = 3.0
 """So long keyframes that the saved map knows wait for the graph that tells whether it is slam's map still."""
+_SHARED = 3
+"""Keyframes of the saved map that slam's graph must still have. Not a share of them: while the mapper was away slam has thinned its map,
+and one keyframe holds the submaps of many that are gone."""
 
 
 class MapperService:
@@ -66,6 +69,8 @@ class MapperService:
         self._saved: SavedMap | None = None if self._keeper is None else self._keeper.load()
         self._held_back: list[Keyframe] = []
         self._held_since_ns = 0
+        self._waited = False
+        """No graph came in time: keyframes wait no longer. The saved map still may."""
         context.on(SLAM_KEYFRAME, self.on_keyframe)
         context.on(SLAM_GRAPH, self.on_graph)
         context.every(_LOOK_S, self.on_timer)
@@ -136,7 +141,7 @@ class MapperService:
         if not self.map.map_id:
             return
         if self._held_back and self._context.clock.now_ns() - self._held_since_ns > _HOLD_S * 1e9:
-            self._saved = None
+            self._waited = True
             self._take_held_back()
         with self._context.health.timed("ground"):
             patches = self._ground.changes(self.map.submaps, self._occasion())
@@ -242,11 +247,13 @@ class MapperService:
                 self._context.publish(MAP_SKETCH, sketch_of(submap, old, points=False, removed=True))
 
     def _restore(self, poses: Mapping[int, Matrix]) -> None:
-        """Take up the saved map when slam still works on it: the same name, a later graph, most keyframes still in it."""
+        """Take up the saved map when slam still works on it: the same name, a later graph, some of its keyframes still in it."""
         saved, self._saved = self._saved, None
         if saved is None or saved.map_id != self.map.map_id or saved.graph_version > self._graph_version:
             return
-        if 2 * sum(s.anchor_id in poses for s in saved.submaps) < len(saved.submaps):
+        anchors = {s.anchor_id for s in saved.submaps}
+        if len(anchors & poses.keys()) < min(_SHARED, len(anchors)):
+            self._context.health.count("saved_map_left")
             return
         back = [s for s in saved.submaps if s.submap_id not in self.map.submaps]
         self.map.restore(back)
@@ -256,7 +263,7 @@ class MapperService:
     def _may_be_saved(self, keyframe: Keyframe) -> bool:
         """Return whether the saved map, not yet taken up or refused, has this keyframe."""
         saved = self._saved
-        if saved is None or saved.map_id != keyframe.map_id:
+        if saved is None or self._waited or saved.map_id != keyframe.map_id:
             return False
         return any(s.submap_id == keyframe.keyframe_id and s.stamp_ns == keyframe.stamp_ns for s in saved.submaps)
 

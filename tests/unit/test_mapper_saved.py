@@ -163,8 +163,43 @@ def test_keyframes_that_come_before_the_graph_wait_for_it(tmp_path: Path) -> Non
             assert world.mapper._context.health.counters["repeated_keyframes"] == 6
         else:
             world.rest(5)
-            assert world.mapper.map.size > 0, "without a graph the saved map is given up"
+            assert world.mapper.map.size > 0, "without a graph they wait no longer"
             assert "submaps_restored" not in world.mapper._context.health.counters
+
+
+def test_the_saved_map_waits_for_a_graph_that_comes_late(tmp_path: Path) -> None:
+    """The bus sends the last keyframes again, and slam, at rest, makes no graph for a while."""
+    world = kept_world(tmp_path)
+    for number in range(6):
+        world.keyframe(number)
+    world.graph(0.2)
+    world.rest(3)
+    world.hub.stop()
+    _written(world)
+    stamp_ns = world.mapper.map.submaps[5].stamp_ns
+    start(world, world.hub.config)
+    shape, world.poses, now_ns = world.poses, {}, world.now_ns
+    world.now_ns = stamp_ns
+    world.keyframe(5)
+    world.poses, world.now_ns = shape, now_ns
+    world.rest(6)
+    assert list(world.mapper.map.submaps) == [5]
+    world.graph(0.0)
+    assert sorted(world.mapper.map.submaps) == [0, 1, 2, 3, 4, 5]
+
+
+def test_a_map_that_slam_has_thinned_meanwhile_is_taken_up(tmp_path: Path) -> None:
+    world = kept_world(tmp_path)
+    for number in range(12):
+        world.keyframe(number)
+    world.graph(0.0)
+    world.rest(3)
+    world.hub.stop()
+    _written(world)
+    start(world, world.hub.config)
+    world.poses = {number: pose for number, pose in world.poses.items() if number in (2, 6, 11)}
+    world.graph(0.0)
+    assert len(world.mapper.map.submaps) == 12, "three of its keyframes place them all"
 
 
 def _written(world: World) -> None:
