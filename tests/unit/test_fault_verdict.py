@@ -13,7 +13,7 @@ from services.evaluate.faults.chain import lost
 from services.evaluate.faults.chain_rows import unsaid
 from services.evaluate.faults.missions import Seen, line_of
 from services.evaluate.faults.rig import Comeback
-from services.evaluate.faults.verdict import Limits, common, faults_of, hold_within_s, summary
+from services.evaluate.faults.verdict import Limits, common, faults_of, held_late, hold_within_s, summary
 from tests.examples import all_messages
 
 GOOD = Seen(
@@ -72,6 +72,18 @@ def test_a_mission_that_ends_for_want_of_what_it_does_not_need_is_complained_of(
     assert "never held before" in next(faults_of("detector", ended, Limits()))
     assert list(faults_of("detector", held, Limits())) == [], "away for long it holds, and lands"
     assert list(faults_of("refiner", replace(held, state="scan"), Limits())) == []
+
+
+def test_a_hold_that_came_late_or_never_is_named() -> None:
+    assert held_late(GOOD) == ""
+    assert "after 0.9 s" in held_late(replace(GOOD, held_s=0.9))
+    assert "after None s" in held_late(replace(GOOD, held_s=None))
+    assert held_late(replace(GOOD, held_s=0.8), moment_s=0.35) == ""
+    assert (
+        held_late(replace(GOOD, held_s=None, state="landing"))
+        == held_late(replace(GOOD, held_s=None, flew=False))
+        == ""
+    )
 
 
 def test_a_loaded_machine_is_forgiven_what_it_made_wait_and_no_more() -> None:

@@ -120,12 +120,7 @@ def start(world: World, config: TreedockConfig) -> None:
 
 
 def test_a_restarted_mapper_goes_on_with_its_map(tmp_path: Path) -> None:
-    world = kept_world(tmp_path)
-    for number in range(6):
-        world.keyframe(number)
-    world.graph(0.2)
-    world.rest(3)
-    world.hub.stop()
+    world = ended_world(tmp_path, 6)
     before = world.mapper.cloud()
     start(world, world.hub.config)
     consumer = Consumer(world.hub, loss=0.0)
@@ -167,15 +162,21 @@ def test_keyframes_that_come_before_the_graph_wait_for_it(tmp_path: Path) -> Non
             assert "submaps_restored" not in world.mapper._context.health.counters
 
 
-def test_the_saved_map_waits_for_a_graph_that_comes_late(tmp_path: Path) -> None:
-    """The bus sends the last keyframes again, and slam, at rest, makes no graph for a while."""
-    world = kept_world(tmp_path)
-    for number in range(6):
+def ended_world(folder: Path, keyframes: int) -> World:
+    """Return a world whose mapper has ended, its map of so many keyframes on disk."""
+    world = kept_world(folder)
+    for number in range(keyframes):
         world.keyframe(number)
     world.graph(0.2)
     world.rest(3)
     world.hub.stop()
     _written(world)
+    return world
+
+
+def test_the_saved_map_waits_for_a_graph_that_comes_late(tmp_path: Path) -> None:
+    """The bus sends the last keyframes again, and slam, at rest, makes no graph for a while."""
+    world = ended_world(tmp_path, 6)
     stamp_ns = world.mapper.map.submaps[5].stamp_ns
     start(world, world.hub.config)
     shape, world.poses, now_ns = world.poses, {}, world.now_ns
@@ -189,13 +190,7 @@ def test_the_saved_map_waits_for_a_graph_that_comes_late(tmp_path: Path) -> None
 
 
 def test_a_map_that_slam_has_thinned_meanwhile_is_taken_up(tmp_path: Path) -> None:
-    world = kept_world(tmp_path)
-    for number in range(12):
-        world.keyframe(number)
-    world.graph(0.0)
-    world.rest(3)
-    world.hub.stop()
-    _written(world)
+    world = ended_world(tmp_path, 12)
     start(world, world.hub.config)
     world.poses = {number: pose for number, pose in world.poses.items() if number in (2, 6, 11)}
     world.graph(0.0)

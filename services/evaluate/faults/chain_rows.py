@@ -157,9 +157,7 @@ def _clocks_off_s(rig: Rig) -> dict[str, float]:
     since_s, off_s = time.monotonic(), dict[str, float]()
     for _ in range(_LOOKS):
         rig.pump(1.0)
-        for name, health in rig.health.items():
+        for name in rig.health:
             if rig.heard_s[name] > since_s:
-                heard_ago_s = time.monotonic() - rig.heard_s[name]
-                now_s = health.stamp_ns * 1e-9 - time.time() + heard_ago_s
-                off_s[name] = max(off_s.get(name, now_s), now_s)
+                off_s[name] = max(off_s.get(name, float("-inf")), rig.stamp_off_s(name))
     return off_s

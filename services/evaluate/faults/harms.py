@@ -22,11 +22,11 @@ from services.common.config import TreedockConfig
 from services.evaluate.faults.bench_rig import Bench
 from services.evaluate.faults.flown import ENDED
 from services.evaluate.faults.killing import passing
-from services.evaluate.faults.missions import NEVER_S, Back, Flights, Seen
+from services.evaluate.faults.missions import NEVER_S, Back, Flights
 from services.evaluate.faults.model import Result, Row
 from services.evaluate.faults.rig import FUSED, ONBOARD, Rig
 from services.evaluate.faults.system import flight_config
-from services.evaluate.faults.verdict import HOLD_S, MOMENT_S
+from services.evaluate.faults.verdict import held_late
 
 _STALL_S = 0.7
 """Longer than the 0.4 s after which a silent slam is held for, shorter than the 1.2 s after which is landed."""
@@ -73,16 +73,7 @@ def _camera_stall(bench: Bench) -> Result:
         again.extend([f"{rig.supervisor.restarts - restarts} restarts"] * (rig.supervisor.restarts > restarts))
         return Back()
 
-    def late(seen: Seen) -> list[str]:
-        if (
-            seen.state in {"hold", "landing"}
-            or not seen.flew
-            or (seen.held_s is not None and seen.held_s <= HOLD_S + MOMENT_S)
-        ):
-            return []
-        return [f"held after {seen.held_s} s"]
-
-    result = passing(bench, "camera stall", stall, lands=False, also=late)
+    result = passing(bench, "camera stall", stall, lands=False, also=held_late)
     measured = {**result.measured, "stall_s": max(stalls)}
     if max(stalls) > _STALL_MOST_S:
         return Result((), measured, result.told, f"the machine is too busy: one stall became {max(stalls):.1f} s long")

@@ -69,11 +69,11 @@ def passing(
     row: str,
     harm: Callable[[Flights], Back],
     lands: bool,
-    also: Callable[[Seen], list[str]] = lambda _: [],
+    also: Callable[[Seen], str] = lambda _: "",
 ) -> Result:
     """Run a fault that passes by itself at random moments: the mission goes on, or may land where ``lands``.
 
-    ``also`` returns in words what else did not hold in one of them.
+    ``also`` returns in words what else did not hold in one of them, empty when all did.
     """
     seen, failed = [], []
     for _ in range(bench.moments):
@@ -81,7 +81,7 @@ def passing(
         flights.moment()
         one = flights.see(row, partial(harm, flights))
         seen.append(one)
-        failed += [f"{one.state}: {word}" for word in (*common(one), *also(one))]
+        failed += [f"{one.state}: {word}" for word in (*common(one), also(one)) if word]
         if one.back_s is not None and one.back_s >= NEVER_S:
             failed.append(f"{one.state}: it did not come back")
         if one.end in ENDED and not lands and not goes_on(one):

@@ -24,7 +24,7 @@ from services.evaluate.faults.missions import NEVER_S, Back, Flights, Seen, line
 from services.evaluate.faults.model import Result
 from services.evaluate.faults.rig import STANDINS, Rig
 from services.evaluate.faults.system import flight_config
-from services.evaluate.faults.verdict import HOLD_S, common, summary
+from services.evaluate.faults.verdict import common, held_late, summary
 
 PLACES = {
     "simulator": "A", "camera": "A", "autopilot": "A", "slam": "B", "refiner": "B", "mapper": "C", "detector": "C",
@@ -126,7 +126,7 @@ def clock_off_s(rig: Rig, name: str) -> tuple[float, float]:
         health = rig.health[name]
         if health.seq not in seen:
             seen.add(health.seq)
-            off_s.append(health.stamp_ns * 1e-9 - (time.time() - (time.monotonic() - rig.heard_s[name])))
+            off_s.append(rig.stamp_off_s(name))
         return len(off_s) >= _HEALTHS
 
     rig.until(enough, _HEALTHS_S)
@@ -185,7 +185,7 @@ def cut(
             one = flights.see(f"cable of {host} out for {for_s:g} s", pull)
             seen.append(one)
             failed += [f"{one.state}: {word}" for word in common(one)]
-            failed += [f"{one.state}: {word}" for word in _held_late(host, one)]
+            failed += [f"{one.state}: {host} cut: {word}" for word in [held_late(one, _MOMENT_S)] if word]
             if one.back_s is not None and one.back_s > _AGAIN_WITHIN_S:
                 failed.append(f"{one.state}: not together again within {_AGAIN_WITHIN_S:.0f} s")
         flights.land()
@@ -200,16 +200,6 @@ def _looked_after_there(rig: Rig, host: str) -> None:
         process = rig.supervisor.children[name].process
         if place == host and process is not None and process.poll() is None:
             rig.supervisor.heard(name, process.pid, "ready")
-
-
-def _held_late(host: str, seen: Seen) -> list[str]:
-    if (
-        seen.state in {"hold", "landing"}
-        or not seen.flew
-        or (seen.held_s is not None and seen.held_s <= HOLD_S + _MOMENT_S)
-    ):
-        return []
-    return [f"{host} cut: held after {seen.held_s} s, not within {HOLD_S} s"]
 
 
 def in_namespaces(row: str, seed: int, moments: int, folder: Path, tell: Callable[[str], None]) -> Result:

@@ -74,6 +74,17 @@ def _flight(service: str, seen: Seen) -> Iterator[str]:
         yield f"held after {seen.held_s} s in {seen.state}, not within {within_s} s"
 
 
+def held_late(seen: Seen, moment_s: float = MOMENT_S) -> str:
+    """Return in words that a fault in flight was not held for within half a second, empty when it was, or nothing was to hold."""
+    if (
+        seen.state in {"hold", "landing"}
+        or not seen.flew
+        or (seen.held_s is not None and seen.held_s <= HOLD_S + moment_s)
+    ):
+        return ""
+    return f"held after {seen.held_s} s, not within {HOLD_S} s"
+
+
 def _flies_on(service: str, seen: Seen) -> Iterator[str]:
     """Yield what of a flight did not go on that does not need the service, or only when it is away for long: then it holds first."""
     if goes_on(seen) or seen.state not in _MOVING or not seen.flew:
