@@ -257,9 +257,8 @@ class Mission:
     def _preflight(self, now_ns: int) -> bool:
         """Return whether the state changed."""
         v = self.board.vehicle
-        if (
-            v is not None and v.armed and not self.config.handheld
-        ):  # whoever armed it flies it; it must not take off later by itself
+        # whoever armed it flies it; it must not take off by itself when he has landed
+        if v is not None and v.armed and not self.config.handheld:
             self.go(Next("failed", "preflight: the vehicle was armed, not by us"), now_ns)
             return True
         faults = missing(self.board, self.config)
